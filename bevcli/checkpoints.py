@@ -16,7 +16,6 @@ from torch import Tensor
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.model.config import ModelConfig
-from bevcli.model.official_keys import from_official
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.parsing.files import open_regular
 from bevcli.parsing.pth import Placeholder, read_pth
@@ -158,6 +157,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     _check_numbers(path, state)
     official = any(key.startswith(OFFICIAL) for key in state)
     if official:
+        from bevcli.model.official_keys import from_official
+
         state, parts = from_official(state)
         left_out += [parts] if parts else []
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)
@@ -185,10 +186,10 @@ def _unwrapped(state: Mapping[str, Tensor], left_out: list[str]) -> Mapping[str,
     if not kept:
         kept, prefixes = dict(state), AVERAGED_PREFIXES
     left_out += [f"{len(state) - len(kept)} running averages (ema_*)"] if len(kept) < len(state) else []
-    found = {match[0] for match in (re.match(prefixes, key) for key in kept) if match}
-    if len(found) != 1 or "" in found:
+    matched_prefixes = {match[0] for match in (re.match(prefixes, key) for key in kept) if match}
+    if len(matched_prefixes) != 1 or "" in matched_prefixes:
         return kept
-    (prefix,) = found
+    (prefix,) = matched_prefixes
     left_out.append(f'the prefix "{prefix}" of all names')
     return {key.removeprefix(prefix): tensor for key, tensor in kept.items()}
 
@@ -223,9 +224,9 @@ def difference(state: Mapping[str, Tensor], expected: Mapping[str, Tensor], clas
     fitting = len(expected) - len(by_kind.get("missing", ())) - len(by_kind.get("misshapen", ()))
     if fitting < LEAST_SHARE * len(expected):
         return f"{fitting} of its {len(expected)} tensors are in the file"
-    own, parts = classes_instead(state, expected, classes, whole=False), []
-    if own is not None:
-        parts.append(f"{counted(own, 'classes')} instead of {classes}")
+    class_count, parts = classes_instead(state, expected, classes, whole=False), []
+    if class_count is not None:
+        parts.append(f"{counted(class_count, 'classes')} instead of {classes}")
         del by_kind["misshapen"]
     words = {"missing": "missing", "unexpected": "too many", "misshapen": "of another shape"}
     for kind, keys in by_kind.items():
@@ -248,7 +249,7 @@ def classes_instead(
     ]
     if not pairs or (whole and len(by_kind) > 1):
         return None
-    counts = {found[0] if wanted[:1] == (classes,) and found[1:] == wanted[1:] else None for wanted, found in pairs}
+    counts = {theirs[0] if ours[:1] == (classes,) and theirs[1:] == ours[1:] else None for ours, theirs in pairs}
     return counts.pop() if len(counts) == 1 else None
 
 
@@ -323,9 +324,9 @@ def _check_numbers(path: Path, state: Mapping[str, Tensor]) -> None:
     """Raises WeightsError, which names the tensor, for a number type that weights do not have, for NaN or infinity."""
     for name, tensor in state.items():
         if tensor.dtype not in FLOATS and not name.endswith(INTEGER_KEY):
-            kind = str(tensor.dtype).removeprefix("torch.")
+            dtype_name = str(tensor.dtype).removeprefix("torch.")
             expected = ", ".join(str(dtype).removeprefix("torch.") for dtype in FLOATS)
-            raise WeightsError(f"{path}: tensor {name}: numbers of type {kind} (expected {expected})")
+            raise WeightsError(f"{path}: tensor {name}: numbers of type {dtype_name} (expected {expected})")
         # Numbers that a stride of 0 repeats are checked once.
         for dimension, stride in enumerate(tensor.stride()):
             if stride == 0 and tensor.shape[dimension] > 1:

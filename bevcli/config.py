@@ -61,21 +61,21 @@ def config_of_table(table: dict[str, Any], file: str) -> ModelConfig:
     return replace(config, class_settings=from_here)
 
 
-def load_table(name_or_path: str | Path, table: str, kind: type[T]) -> T:
-    """A table of a model's file, TRACKING or TRAINING, as a dataclass of type `kind`; its defaults without the table.
+def load_table(name_or_path: str | Path, table: str, cls: type[T]) -> T:
+    """A table of a model's file, TRACKING or TRAINING, as a dataclass of type `cls`; its defaults without the table.
 
     Raises ConfigError where there is no such file, or where its contents are wrong.
     """
     contents, file = read_model_file(str(name_or_path))
-    return settings_of_table(contents, table, kind, file)
+    return settings_of_table(contents, table, cls, file)
 
 
-def settings_of_table(contents: dict[str, Any], table: str, kind: type[T], file: str) -> T:
+def settings_of_table(contents: dict[str, Any], table: str, cls: type[T], file: str) -> T:
     """A table in the parsed contents of a model's file, as `load_table`. Raises ConfigError, which names `file`."""
     settings = contents.get(table, {})
     if not isinstance(settings, dict):
         raise ConfigError(f'{file}: "{table}" must be a table, but is {settings!r:.60}')
-    return _dataclass(settings, kind, file, f"{table}.")
+    return _dataclass(settings, cls, file, f"{table}.")
 
 
 def as_table(config: ModelConfig, tracking: object = None) -> dict[str, Any]:
@@ -146,9 +146,9 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     return contents | {"name": name} if of_weights else contents, file
 
 
-def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> T:
-    fields = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(kind)
+def _dataclass(table: dict[str, Any], cls: type[T], file: str, prefix: str) -> T:
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    hints = typing.get_type_hints(cls)
     for key in table.keys() - fields.keys():
         hint = did_you_mean(key, fields, f"expected one of {', '.join(fields)}", '"')
         raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
@@ -158,29 +158,29 @@ def _dataclass(table: dict[str, Any], kind: type[T], file: str, prefix: str) -> 
         if name not in values and not optional:
             raise ConfigError(f'{file}: "{prefix}{name}" is missing; expected {_describe(hints[name])}')
     try:
-        return kind(**values)
+        return cls(**values)
     except ValueError as error:
-        where = f"[{prefix[:-1]}]: " if prefix else ""
-        raise ConfigError(f"{file}: {where}{error}") from error
+        location = f"[{prefix[:-1]}]: " if prefix else ""
+        raise ConfigError(f"{file}: {location}{error}") from error
 
 
-def _value(value: Any, kind: Any, file: str, key: str) -> Any:
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return _dataclass(value, typing.cast(type, kind), file, f"{key}.")
-    kinds: dict[str, Any] = {part.kind: part for part in typing.get_args(kind) if hasattr(part, "kind")}
+def _value(value: Any, hint: Any, file: str, key: str) -> Any:
+    if dataclasses.is_dataclass(hint) and isinstance(value, dict):
+        return _dataclass(value, typing.cast(type, hint), file, f"{key}.")
+    kinds: dict[str, Any] = {member.kind: member for member in typing.get_args(hint) if hasattr(member, "kind")}
     if kinds and isinstance(value, dict):
-        chosen = value.get("kind", next(iter(kinds)))
-        if chosen not in kinds:
-            raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {chosen!r:.60}')
-        return _dataclass(value, kinds[chosen], file, f"{key}.")
-    if typing.get_origin(kind) is Mapping and isinstance(value, dict):
-        return {name: _value(part, typing.get_args(kind)[1], file, f"{key}.{name}") for name, part in value.items()}
+        kind = value.get("kind", next(iter(kinds)))
+        if kind not in kinds:
+            raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {kind!r:.60}')
+        return _dataclass(value, kinds[kind], file, f"{key}.")
+    if typing.get_origin(hint) is Mapping and isinstance(value, dict):
+        return {name: _value(item, typing.get_args(hint)[1], file, f"{key}.{name}") for name, item in value.items()}
     try:
         if _is_finite(value):
-            return msgspec.convert(value, kind)
+            return msgspec.convert(value, hint)
     except msgspec.ValidationError:
         pass
-    raise ConfigError(f'{file}: "{key}" must be {_describe(kind)}, but is {value!r}')
+    raise ConfigError(f'{file}: "{key}" must be {_describe(hint)}, but is {value!r}')
 
 
 def _is_finite(value: Any) -> bool:
@@ -190,9 +190,9 @@ def _is_finite(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def _describe(kind: Any) -> str:
+def _describe(hint: Any) -> str:
     """A type in words, for an error message."""
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return " or ".join(f'"{argument}"' for argument in arguments)
     if origin in (typing.Union, types.UnionType):
@@ -202,4 +202,4 @@ def _describe(kind: Any) -> str:
             return f"a list, each element {_describe(arguments[0])}"
         return f"a list of {len(arguments)}, each element {_describe(arguments[0])}"
     names = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
-    return names.get(kind, "a table")
+    return names.get(hint, "a table")

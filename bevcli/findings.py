@@ -33,10 +33,10 @@ class Finding:
     @property
     def line(self) -> str:
         """The finding on one line: `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
-        where = f"camera {self.camera}: " if self.camera else ""
+        prefix = f"camera {self.camera}: " if self.camera else ""
         numbers = [f"{word} {value}" for word, value in (("expected", self.expected), ("found", self.found)) if value]
         brackets = f" ({', '.join(numbers)})" if numbers else ""
-        return f"{where}{self.message}{brackets}" + (f": {self.advice}" if self.advice else "")
+        return f"{prefix}{self.message}{brackets}" + (f": {self.advice}" if self.advice else "")
 
 
 def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -43,13 +43,13 @@ def _temporary_cache() -> bool:
     """Sets numba's cache folder to one in the temporary folder, once. False where there is no such place."""
     user = os.getuid() if os.name == "posix" else None
     folder = None if user is None else _private_folder(Path(tempfile.gettempdir()) / f"bevcli-numba-{user}", user)
-    where = "compiled functions are not cached: every start takes some seconds longer"
+    note = "compiled functions are not cached: every start takes some seconds longer"
     if folder is not None:
         setattr(numba.config, "CACHE_DIR", str(folder))  # noqa: B010, an attribute that numba makes at run time
-        where = f"compiled functions are cached in {folder}"
+        note = f"compiled functions are cached in {folder}"
     logging.getLogger("bevcli").warning(
         "note: neither the installation nor the home folder can be written: %s (NUMBA_CACHE_DIR sets another folder)",
-        where,
+        note,
     )
     return folder is not None
 
@@ -58,8 +58,8 @@ def _private_folder(path: Path, user: int) -> Path | None:
     """The folder, made where it is missing. None where it is not this user's alone: cached functions are code."""
     try:
         path.mkdir(mode=0o700, exist_ok=True)
-        facts = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    ours = stat.S_ISDIR(facts.st_mode) and facts.st_uid == user and not facts.st_mode & 0o077
+    ours = stat.S_ISDIR(status.st_mode) and status.st_uid == user and not status.st_mode & 0o077
     return path if ours and os.access(path, os.W_OK) else None

@@ -82,31 +82,31 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
     def decorate(cls: _Class) -> _Class:
         made: Any = dataclasses.dataclass(frozen=True)(cls)
         made.panel = panel
-        stated = ((field.name, field.metadata.get("option")) for field in dataclasses.fields(made))
-        attributes = [f"    {name}: {option.help}" for name, option in stated if option]
+        options = ((field.name, field.metadata.get("option")) for field in dataclasses.fields(made))
+        attributes = [f"    {name}: {option.help}" for name, option in options if option]
         made.__doc__ = "\n".join([inspect.cleandoc(cls.__doc__ or ""), "", "Attributes:", *attributes])
         return made
 
     return decorate
 
 
-def named(kind: type[Any], name: str) -> str:
+def named(cls: type[Any], name: str) -> str:
     """An option of a dataclass in a text for both, Python and the command line: "`rate_hz` (`--rate`)"."""
-    (field,) = (field for field in dataclasses.fields(kind) if field.name == name)
+    (field,) = (field for field in dataclasses.fields(cls) if field.name == name)
     return f"`{name}` (`{field.metadata['option'].spellings(name)[0].partition('/')[0]}`)"
 
 
-def gather(kind: type[_Options], given: _Options | None, changes: Mapping[str, Any]) -> _Options:
-    """The options of a call that takes the dataclass or keywords: `given` or the defaults, with the changes.
+def gather(cls: type[_Options], options: _Options | None, changes: Mapping[str, Any]) -> _Options:
+    """The options of a call that takes the dataclass or keywords: `options` or the defaults, with the changes.
 
     A text becomes a Path where the field is one, and one or a list of them a tuple where the field is that. Raises
     TypeError for a keyword that the dataclass does not have.
     """
-    hints = get_type_hints(kind)
+    hints = get_type_hints(cls)
     made = {name: _as_paths(value, hints.get(name)) for name, value in changes.items()}
-    if given is None:
-        return kind(**made)
-    return dataclasses.replace(given, **made) if made else given  # type: ignore[type-var]
+    if options is None:
+        return cls(**made)
+    return dataclasses.replace(options, **made) if made else options  # type: ignore[type-var]
 
 
 def _as_paths(value: Any, hint: Any) -> Any:
@@ -118,27 +118,27 @@ def _as_paths(value: Any, hint: Any) -> Any:
 
 def spread(changes: Mapping[str, Any], *kinds: type[Any]) -> tuple[Any, ...]:
     """Keywords of a call, spread over dataclasses of options; last, a dict of those that are in none of them."""
-    left, made = dict(changes), []
-    for kind in kinds:
-        names = [field.name for field in dataclasses.fields(kind) if field.name in changes]
-        made.append(gather(kind, None, {name: changes[name] for name in names}))
+    rest, made = dict(changes), []
+    for cls in kinds:
+        names = [field.name for field in dataclasses.fields(cls) if field.name in changes]
+        made.append(gather(cls, None, {name: changes[name] for name in names}))
         for name in names:
-            left.pop(name, None)
-    return (*made, left)
+            rest.pop(name, None)
+    return (*made, rest)
 
 
-def refuse(left: Mapping[str, Any], function: str, *kinds: type[Any]) -> None:
+def refuse(rest: Mapping[str, Any], function: str, *kinds: type[Any]) -> None:
     """Raise TypeError for keywords that a function does not take. kinds: the dataclasses of its options."""
-    if left:
-        name, known = next(iter(left)), [field.name for kind in kinds for field in dataclasses.fields(kind)]
-        hint = did_you_mean(name, known, f"expected some of {', '.join(sorted(set(known)))}")
+    if rest:
+        name, names = next(iter(rest)), [field.name for cls in kinds for field in dataclasses.fields(cls)]
+        hint = did_you_mean(name, names, f"expected some of {', '.join(sorted(set(names)))}")
         raise TypeError(f"{function}() has no option {name}: {hint}")
 
 
-def defaults(kind: type[Any]) -> dict[str, Any]:
+def defaults(cls: type[Any]) -> dict[str, Any]:
     """The default of each option of a dataclass that has one."""
     values = {}
-    for field in dataclasses.fields(kind):
+    for field in dataclasses.fields(cls):
         if field.default_factory is not MISSING:
             values[field.name] = field.default_factory()
         elif field.default is not MISSING:

@@ -40,9 +40,9 @@ def say(*texts: object, err: bool = False) -> None:
     print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
-def did_you_mean(name: str, known: Iterable[str], otherwise: str, quote: str = "") -> str:
+def did_you_mean(name: str, candidates: Iterable[str], otherwise: str, quote: str = "") -> str:
     """The question for the known name that is most similar, or another text. quote: mark around the name."""
-    near = difflib.get_close_matches(name, list(known), n=1)
+    near = difflib.get_close_matches(name, list(candidates), n=1)
     return f"did you mean {quote}{near[0]}{quote}?" if near else otherwise
 
 

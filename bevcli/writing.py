@@ -120,7 +120,7 @@ def partial_path(path: Path) -> Path:
     return path.with_name(path.name + PARTIAL)
 
 
-def weights_folder(chosen: Path | None = None) -> Path:
+def weights_folder(folder: Path | None = None) -> Path:
     """The folder of downloaded weights: the chosen one, $BEVCLI_WEIGHTS_DIR, or ~/.cache/bevcli/weights."""
     named = os.environ.get("BEVCLI_WEIGHTS_DIR")
-    return chosen or (Path(named) if named else user_cache() / "weights")
+    return folder or (Path(named) if named else user_cache() / "weights")

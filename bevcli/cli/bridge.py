@@ -74,18 +74,18 @@ class _Flag:
 
     def parameter(self) -> Parameter:
         """The parameter of a function, as typer reads it."""
-        option, kind, default = self.option, self.kind, self.default
-        kinds = get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
+        option, annotation, default = self.option, self.kind, self.default
+        kinds = get_args(annotation) if get_origin(annotation) in _UNIONS else (annotation,)
         if Path in kinds:  # of several that Python takes, such as `str | Path | None`
-            kind = Path | None if type(None) in kinds else Path
+            annotation = Path | None if type(None) in kinds else Path
         if option.flag_value is not None:
-            kind, default = bool, False
+            annotation, default = bool, False
         elif option.repeatable or option.parse is not None:
-            kind = str if option.parse is not None else get_args(self.kind)[0]
-            kind = types.GenericAlias(list, (kind,)) if option.repeatable else kind
+            annotation = str if option.parse is not None else get_args(self.kind)[0]
+            annotation = types.GenericAlias(list, (annotation,)) if option.repeatable else annotation
             if default is not Parameter.empty:
-                kind, default = kind | None, None
-        value = kind  # what `--help` calls by its name: PATH, TEXT or the choices
+                annotation, default = annotation | None, None
+        value = annotation  # what `--help` calls by its name: PATH, TEXT or the choices
         while get_origin(value) in (list, tuple, *_UNIONS):
             value = get_args(value)[0]
         metavar = self.name.upper() if option.is_argument else "|".join(get_args(value)) or _METAVARS.get(value)
@@ -97,18 +97,18 @@ class _Flag:
         else:
             settings |= {"min": option.minimum, "max": option.maximum, "autocompletion": option.complete}
             info = typer.Option(*option.spellings(self.name), rich_help_panel=self.panel, **settings)
-        return Parameter(self.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
+        return Parameter(self.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[annotation, info])
 
-    def value(self, given: Any) -> Any:
+    def value(self, argument: Any) -> Any:
         """The field's value for what typer has read; MISSING for its default. Raises click's usage error."""
         if self.option.flag_value is not None:
-            return self.option.flag_value if given else MISSING
+            return self.option.flag_value if argument else MISSING
         if self.option.parse is None and not self.option.repeatable:
-            return given
-        if given in (None, [], ()):
+            return argument
+        if argument in (None, [], ()):
             return MISSING
         try:
-            return tuple(given) if self.option.parse is None else self.option.parse(given)
+            return tuple(argument) if self.option.parse is None else self.option.parse(argument)
         except ValueError as error:
             name = self.option.spellings(self.name)[0]
             raise typer.BadParameter(str(error), param_hint=name) from None
@@ -143,14 +143,14 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             parts.append(parameter.replace(kind=Parameter.KEYWORD_ONLY, annotation=hints[name]))
     inputs = [part for part in parts if isinstance(part, _Flag) and part.option.reads]
 
-    def run(**given: Any) -> None:
-        read = [(given[flag.name], flag) for flag in inputs]
+    def run(**arguments: Any) -> None:
+        read = [(arguments[flag.name], flag) for flag in inputs]
         for parameter, (make, fields) in makers.items():
-            values = {name: flag.value(given.pop(name)) for name, flag in fields.items()}
-            given[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
+            values = {name: flag.value(arguments.pop(name)) for name, flag in fields.items()}
+            arguments[parameter] = make(**{name: value for name, value in values.items() if value is not MISSING})
         for value, flag in read:  # before anything is imported that takes seconds
             _require(value, flag)
-        function(**given)
+        function(**arguments)
 
     run.__name__, run.__doc__, run.__module__ = function.__name__, function.__doc__, function.__module__
     made = [part.parameter() if isinstance(part, _Flag) else part for part in parts]
@@ -192,13 +192,13 @@ def _flags_of(hint: Any, part: Part) -> dict[str, _Flag]:
     """The options that a command takes of a dataclass or of all formats, by the names of the fields."""
     flags: dict[str, _Flag] = {}
     classes: list[type[Any]] = [*formats()] if hint == FormatValues else [hint]
-    for kind in classes:
-        kinds, values = get_type_hints(kind), defaults(kind)
-        for field in dataclasses.fields(kind):
+    for cls in classes:
+        kinds, values = get_type_hints(cls), defaults(cls)
+        for field in dataclasses.fields(cls):
             option, name = field.metadata.get("option"), field.name
             is_taken = name not in part.without and (not part.only or name in part.only)
             if option is not None and not option.hidden and is_taken:
                 default = values.get(name, Parameter.empty)
-                flags.setdefault(name, _Flag(name, option, kinds[name], default, option.panel or kind.panel))
+                flags.setdefault(name, _Flag(name, option, kinds[name], default, option.panel or cls.panel))
     assert set(part.only) <= flags.keys(), f"{hint}: {part.only}"
     return flags

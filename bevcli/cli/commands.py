@@ -2,9 +2,8 @@
 
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -81,7 +80,7 @@ def viz(
         viewing.record_drive(shown, options, recording, source, format_options)
         return
     kinds = (ViewOptions, RecordingOptions, InputOptions, *formats())
-    usual = {name: (kind, value) for kind in kinds for name, value in defaults(kind).items()}
+    usual = {name: (cls, value) for cls in kinds for name, value in defaults(cls).items()}
     for_drives = {
         "boxes": options.boxes,
         "out": options.out,
@@ -89,8 +88,8 @@ def viz(
         **vars(source),
         **format_options,
     }
-    if given := [name for name, value in for_drives.items() if value != usual[name][1]]:
-        option = named(usual[given[0]][0], given[0])
+    if changed := [name for name, value in for_drives.items() if value != usual[name][1]]:
+        option = named(usual[changed[0]][0], changed[0])
         raise InputError(f"{shown}: is a recording, and {option} is for a drive: remove it, or pass the drive")
     viewing.show(viewing.recording_in(shown), options)
 
@@ -127,26 +126,26 @@ def project_debug(
     """
     from bevcli.rig.check_calibration import model_notes
 
-    given = {name: value for name, value in format_options.items() if value not in (None, {})}
-    if options.sequence is not None and "calibration" in given:
+    drive_options = {name: value for name, value in format_options.items() if value not in (None, {})}
+    if options.sequence is not None and "calibration" in drive_options:
         raise InputError("--calibration and --sequence exclude each other: pass the drive, and its --calibration")
     check = bevcli.check_calibration(
-        input, options.sequence, options.frame, allow_outside=source.allow_outside, **given
+        input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
     )
     model, gap = options.model or "demo", None
     if not check.errors:
         if options.sequence is not None:
-            given["calibration"] = input
-        how = {"ground_truth": False, "allow_outside": source.allow_outside, **given}
-        open_drive = partial(bevcli.open_sequence, options.sequence or input, **how)
+            drive_options["calibration"] = input
+        how = {"ground_truth": False, "allow_outside": source.allow_outside, **drive_options}
+        path = options.sequence or input
         if options.motion:
             from bevcli.workshop.calibration.core_options import check_motion
 
-            check = check.with_findings(check_motion(open_drive))
+            check = check.with_findings(check_motion(_drive_of(path, **how)))
         if options.model is not None or options.against is not None:
             from bevcli.workshop.trust.gap_option import gap_of_rigs
 
-            gap = gap_of_rigs(check, model, options.against, open_drive)
+            gap = gap_of_rigs(check, model, options.against, _drive_of(path, **{**how, "ego_motion": "optional"}))
             check = replace(check, further={"rig_gap": gap.to_dict()})
     folder = options.out or Path("runs") / f"{check.name}-project-debug"
     written = check.write(folder) + (gap.write(folder) if gap else [])
@@ -161,3 +160,11 @@ def project_debug(
         say(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)
+
+
+def _drive_of(path: Path, **options: Any) -> "bevcli.Drive | None":
+    """The drive in a path; None of a calibration alone, or of a drive with errors, which the check reports."""
+    try:
+        return bevcli.open_sequence(path, **options)
+    except InputError:
+        return None

@@ -129,8 +129,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         say(f"bevcli {__version__}")
         raise typer.Exit
 
@@ -165,9 +165,9 @@ def program() -> Iterator[None]:
             os._exit(1)
         sys.exit(1)
     except OSError as error:  # the system refuses: no space, no permission, a name that is too long
-        where = "" if error.filename is None else f"{error.filename}: "
+        prefix = "" if error.filename is None else f"{error.filename}: "
         message = None if error.strerror else system_error(error)
-        say(f"error: {message or one_line(where + str(error.strerror or error))}", err=True)
+        say(f"error: {message or one_line(prefix + str(error.strerror or error))}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         sys.exit(1)
     except Exception as error:

@@ -115,8 +115,8 @@ class Progress:
             return f"{self.done}/{self.total} {self.unit}"
         unit_s = max(time.perf_counter() - self.started, 1e-9) / (self.done - self.skipped)
         pace = f"{1 / unit_s:.2f} per second" if unit_s <= SLOW_S else f"{unit_s:.1f} s each"
-        left = f"{duration((self.total - self.done) * unit_s)} left"
-        return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, left, self.detail)))
+        remaining = f"{duration((self.total - self.done) * unit_s)} left"
+        return ", ".join(filter(None, (f"{self.done}/{self.total} {self.unit}", pace, remaining, self.detail)))
 
 
 def _bar(stream: TextIO) -> "rich.progress.Progress":

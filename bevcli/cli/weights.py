@@ -63,8 +63,8 @@ def fetch(
     from bevcli.published import hub_model, named_weights
 
     if is_of_hub(name):
-        found = hub_model(name, fetch=True)
-        say(f"{found.source}\n{found.weights}\nnext: bevcli run SEQUENCE --model {name}")
+        model = hub_model(name, fetch=True)
+        say(f"{model.source}\n{model.weights}\nnext: bevcli run SEQUENCE --model {name}")
         return
     fetched = fetch_with_bar(named_weights(name, options.weights_dir), force=force)
     rows = [
@@ -197,8 +197,8 @@ def _named_as_text(listed: "list[NamedWeights]") -> str:
         scores = ", ".join(f"{name} {100 * value:.1f}" for name, value in list(weights.source.published.items())[:2])
         size = "unknown" if weights.size is None else f"{weights.size / 1e6:.1f} MB"
         source = weights.source.url or weights.source.source or f"by hand: {weights.source.page}"
-        where = source if weights.here is None else f"here: {weights.here}"
-        rows.append((weights.name, weights.model, scores, size, weights.source.licence, where))
+        location = source if weights.here is None else f"here: {weights.here}"
+        rows.append((weights.name, weights.model, scores, size, weights.source.licence, location))
     return aligned(rows, left=range(6))
 
 

@@ -121,20 +121,20 @@ class Boxes3D:
         if isinstance(selection, int | np.integer):
             return self._box(int(selection))
         key = selection if isinstance(selection, slice) else np.asarray(selection)
-        chosen: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
-        return Boxes3D(**chosen)
+        columns: dict[str, Any] = {name: None if c is None else c[key] for name, c in vars(self).items()}
+        return Boxes3D(**columns)
 
     def __iter__(self) -> Iterator[Box3D]:
         return map(self._box, range(len(self)))
 
     def __repr__(self) -> str:
         names, counts = np.unique(self.classes, return_counts=True)
-        listed = ", ".join(f"{count} {names[i]}" for i, count in sorted(enumerate(counts), key=lambda each: -each[1]))
+        listed = ", ".join(f"{count} {names[i]}" for i, count in sorted(enumerate(counts), key=lambda pair: -pair[1]))
         return f"Boxes3D({len(self)} boxes{': ' if listed else ''}{listed})"
 
     def _box(self, index: int) -> Box3D:
-        found = {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
-        row = {key: values[index].item() for key, values in found.items() if values is not None}
+        columns = {column.key: getattr(self, name) for name, column in OPTIONAL_COLUMNS.items()}
+        row = {key: values[index].item() for key, values in columns.items() if values is not None}
         center, size, yaw, velocity = (c[index] for c in (self.centers, self.sizes_lwh, self.yaws, self.velocities))
         return Box3D(str(self.classes[index]), row.pop("score", None), center, size, float(yaw), velocity, row)
 
@@ -155,12 +155,12 @@ class Boxes3D:
     @staticmethod
     def concatenate(parts: Iterable["Boxes3D"]) -> "Boxes3D":
         """All boxes of the parts. An optional column is kept if every part with boxes has it."""
-        filled = [part for part in parts if len(part)]
+        filled = [boxes for boxes in parts if len(boxes)]
         if not filled:
             return Boxes3D.empty()
         columns: dict[str, Any] = {}
         for field in fields(Boxes3D):
-            values = [getattr(part, field.name) for part in filled]
+            values = [getattr(boxes, field.name) for boxes in filled]
             columns[field.name] = None if any(v is None for v in values) else np.concatenate(values)
         return Boxes3D(**columns)
 

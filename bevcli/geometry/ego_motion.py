@@ -140,11 +140,11 @@ class EgoMotion:
         return row, (clipped - int(times[row])) / (int(times[row + 1]) - int(times[row]))
 
 
-def nearest(times: NDArray[Any], wanted: ArrayLike) -> NDArray[np.int64]:
+def nearest(times: NDArray[Any], targets: ArrayLike) -> NDArray[np.int64]:
     """(...) the index of the time nearest to each wanted one (...), the earlier of two. times: (T,), increasing."""
-    later = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    later = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))
     earlier, later = later - 1, np.minimum(later, len(times) - 1)
-    return np.where(wanted - times[earlier] <= times[later] - wanted, earlier, later)
+    return np.where(targets - times[earlier] <= times[later] - targets, earlier, later)
 
 
 # Times (T,) in ns, translations (T, 3) in metres in the world frame, and quaternions (T, 4) of world_from_ego.

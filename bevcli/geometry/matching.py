@@ -90,7 +90,7 @@ class DetectionConfig(ClassRanges):
 
 def ranges_m(classes: Iterable[ObjectClass]) -> dict[str, float]:
     """The range of each class, by name."""
-    return {kind.name: kind.range_m for kind in classes}
+    return {object_class.name: object_class.range_m for object_class in classes}
 
 
 @dataclass(frozen=True)
@@ -149,15 +149,15 @@ def match_greedily(
     free = np.broadcast_to(truths_of >= 0, (len(distances_m), *truths_of.shape)).copy()  # (D, F, K)
     for turn in range(predictions_of.shape[1]):
         frames = np.flatnonzero((predictions_of[:, turn] >= 0) & (truths_of[:, 0] >= 0))  # (A,)
-        chosen = predictions_of[frames, turn]
-        offsets = centers[truths_of[frames]] - predictions.boxes.centers[chosen, None, :2]
+        turn_rows = predictions_of[frames, turn]
+        offsets = centers[truths_of[frames]] - predictions.boxes.centers[turn_rows, None, :2]
         distance = np.hypot(offsets[..., 0], offsets[..., 1])  # (A, K)
         for row, limit in enumerate(distances_m):
             candidates = np.where(free[row, frames], distance, np.inf)
             nearest = candidates.argmin(axis=1)
             is_match = candidates[np.arange(len(frames)), nearest] < limit
             free[row, frames[is_match], nearest[is_match]] = False
-            matched[row, chosen[is_match]] = truths_of[frames[is_match], nearest[is_match]]
+            matched[row, turn_rows[is_match]] = truths_of[frames[is_match], nearest[is_match]]
     return matched
 
 

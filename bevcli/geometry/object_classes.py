@@ -105,13 +105,13 @@ class ClassSettings:
     def resolve(self, name: str) -> ObjectClass:
         """The class of this name with these settings."""
         base = NUSCENES_CLASSES.get(self.like or name, ObjectClass(name))
-        own = ("range_m", "gate_m", "tracked", "attributes", "kitti", "mesh")
-        given: dict[str, Any] = {key: getattr(self, key) for key in own if getattr(self, key) is not None}
+        keys = ("range_m", "gate_m", "tracked", "attributes", "kitti", "mesh")
+        changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
         if self.attributes is not None:
-            given["undefined_errors"] = () if any(self.attributes) else (*base.undefined_errors, "attr_err")
+            changes["undefined_errors"] = () if any(self.attributes) else (*base.undefined_errors, "attr_err")
         if self.color is not None:
-            given["color"] = color_of_hex(self.color)
-        return replace(base, name=name, **given)
+            changes["color"] = color_of_hex(self.color)
+        return replace(base, name=name, **changes)
 
 
 def color_of_hex(text: str) -> Color:
@@ -130,33 +130,33 @@ def object_classes(names: Iterable[str], settings: Mapping[str, ClassSettings]) 
 
     Classes that are drawn like the same nuScenes class have its colour only once: the others take one by their index.
     """
-    given = tuple(names)
-    if not given:
+    class_names = tuple(names)
+    if not class_names:
         raise ValueError("classes is empty (expected at least one name)")
-    for name in given:
+    for name in class_names:
         if not (name.strip() == name and 0 < len(name) <= 100 and name.isprintable()):
             raise ValueError(f"classes: {name!r:.60} is not a name (expected up to 100 printable characters)")
-        if given.count(name) > 1:
+        if class_names.count(name) > 1:
             raise ValueError(f'classes: "{name}" stands there twice')
-    unknown = settings.keys() - set(given)
+    unknown = settings.keys() - set(class_names)
     if unknown:
-        raise ValueError(f'class_settings: "{min(unknown)}" is not among the classes ({", ".join(given)})')
+        raise ValueError(f'class_settings: "{min(unknown)}" is not among the classes ({", ".join(class_names)})')
     made: dict[str, ObjectClass] = {}
-    for name in given:
+    for name in class_names:
         resolved = settings.get(name, ClassSettings()).resolve(name)
         taken = any(other.color == resolved.color for other in made.values())
-        stated = name in settings and settings[name].color is not None
-        made[name] = replace(resolved, color=None) if taken and not stated else resolved
+        has_color = name in settings and settings[name].color is not None
+        made[name] = replace(resolved, color=None) if taken and not has_color else resolved
     return made
 
 
 def are_nuscenes(classes: Mapping[str, ObjectClass]) -> bool:
     """True for the ten classes with nuScenes' own settings: scores are then comparable to nuScenes'."""
-    return {name: _scoring(kind) for name, kind in classes.items()} == {
-        name: _scoring(kind) for name, kind in NUSCENES_CLASSES.items()
+    return {name: _scoring(object_class) for name, object_class in classes.items()} == {
+        name: _scoring(object_class) for name, object_class in NUSCENES_CLASSES.items()
     }
 
 
-def _scoring(kind: ObjectClass) -> ObjectClass:
+def _scoring(object_class: ObjectClass) -> ObjectClass:
     """The class without what changes no score."""
-    return replace(kind, color=None, kitti="", gate_m=1.0, mesh="")
+    return replace(object_class, color=None, kitti="", gate_m=1.0, mesh="")

@@ -90,8 +90,8 @@ class AttentionProbe(ExitStack):
         hits: PillarHits = arguments[2]
         counts = torch.tensor(hits.hits_per_camera, device=hits.cell.device)
         camera = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
-        chosen = torch.isin(hits.cell, self.cells) & hits.is_seen
-        self.spatial = SpatialSamples(camera[chosen], hits.cell[chosen], self._locations[chosen], self._weights[chosen])
+        shown = torch.isin(hits.cell, self.cells) & hits.is_seen
+        self.spatial = SpatialSamples(camera[shown], hits.cell[shown], self._locations[shown], self._weights[shown])
 
 
 def probe_cells(probes: tuple[tuple[float, float], ...], grid: BevGrid) -> Tensor:
@@ -128,16 +128,16 @@ def _samples(
     """The samples of a cell by camera; no entry for a camera that does not see it."""
     if samples is None:
         return {}
-    chosen = (samples.cell == cell).nonzero()[:, 0].tolist()
+    rows = (samples.cell == cell).nonzero()[:, 0].tolist()
     size = np.array(prepared.images.shape[:-3:-1], dtype=np.float64)  # (width, height)
     result = {}
-    for row in chosen:
+    for row in rows:
         index = int(samples.camera[row])
         camera = prepared.frame.rig[prepared.assignment.cameras[index]]
         network_pixels = samples.locations[row].float().cpu().double().numpy().reshape(-1, 2) * size
         scale = prepared.scales[index]
         pixels = (network_pixels + config.image.crop_box[:2] - resize_shift(scale, config.image)) / scale
         weights = samples.weights[row].float().cpu().double().numpy().reshape(-1)
-        shares = weights / (len(chosen) * samples.weights.shape[1])  # the sum over all heads and cameras is 1
+        shares = weights / (len(rows) * samples.weights.shape[1])  # the sum over all heads and cameras is 1
         result[camera.name] = CameraSamples(camera.distorted(pixels), shares)
     return result

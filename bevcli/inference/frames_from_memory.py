@@ -29,9 +29,9 @@ def checked_images(
     return {name: CameraImage(timestamp_ns, np.ascontiguousarray(pixels)) for name, pixels in turned}
 
 
-def check_cameras(given: Mapping[str, object], rig: CameraRig, argument: str) -> None:
+def check_cameras(by_camera: Mapping[str, object], rig: CameraRig, argument: str) -> None:
     """Raise InputError for a camera that the rig does not have."""
-    for name in given:
+    for name in by_camera:
         if name not in rig.names:
             raise InputError(f"`{argument}`: camera {name} is not in the rig (it has {', '.join(rig.names)})")
 
@@ -48,9 +48,9 @@ def whole_nanoseconds(timestamp_ns: Any) -> int:
 
 def _check_image(pixels: NDArray[Any], camera: Camera) -> None:
     """Raise InputError where pixels are not an image of a camera."""
-    shape, kind = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
-    if shape != (camera.height, camera.width, 3) or kind != np.uint8:
-        found = kind if shape is None else f"{kind} of shape {shape}"
+    shape, dtype = getattr(pixels, "shape", None), getattr(pixels, "dtype", type(pixels).__name__)
+    if shape != (camera.height, camera.width, 3) or dtype != np.uint8:
+        found = dtype if shape is None else f"{dtype} of shape {shape}"
         raise InputError(
             f"`images`: camera {camera.name}: expected uint8 of shape ({camera.height}, {camera.width}, 3), as in the "
             f"rig (found {found})"

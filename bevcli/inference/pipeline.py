@@ -131,7 +131,7 @@ def read_back(outputs: ModelOutputs, images: Tensor) -> Callable[[], tuple[Model
     last = outputs.last_layers()
     checked = [last.bev, last.class_logits, last.box_codes, upload(images, last.bev.device)]
     sums = torch.stack([tensor.sum(dtype=torch.float32) for tensor in checked])  # NaN and infinity stay in a sum
-    moved = {part.name: getattr(last, part.name) for part in fields(last) if part.name not in last.stay_on_device}
+    moved = {item.name: getattr(last, item.name) for item in fields(last) if item.name not in last.stay_on_device}
     tensors = [sums, *(tensor for _, tensor in tensors_in(list(moved.values())))]
     copied = _copies(tensors)
 
@@ -173,11 +173,11 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
     """
     origins: list[str] = []
 
-    def check(value: object, part: str = "") -> None:
+    def check(value: object, module: str = "") -> None:
         tensors = [(name, tensor) for name, tensor in tensors_in(value, "history") if tensor.is_floating_point()]
         bad = [name for name, tensor in tensors if not torch.isfinite(tensor).all()]
         if bad and not origins:
-            origins.append(part or f"input {bad[0]}")
+            origins.append(module or f"input {bad[0]}")
 
     with ExitStack() as hooks:
         hooks.enter_context(model.register_forward_pre_hook(lambda module, arguments: check(arguments)))
@@ -192,8 +192,8 @@ def origin(model: nn.Module, step: Callable[[], object]) -> str:
 def describe(name: str) -> str:
     """A module's name with the part of the paper's figure: "encoder layer 3 (encoder.layers.3.norms.0)"."""
     layer = re.match(r"(encoder|decoder)\.layers\.(\d+)", name)
-    part = f"{layer[1]} layer {layer[2]}" if layer else name.split(".")[0].replace("_", " ")
-    return part if part == name else f"{part} ({name})"
+    label = f"{layer[1]} layer {layer[2]}" if layer else name.split(".")[0].replace("_", " ")
+    return label if label == name else f"{label} ({name})"
 
 
 class StageClock(ExitStack):

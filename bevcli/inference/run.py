@@ -41,13 +41,13 @@ def run(model: Model, sequence: Drive, **options: Any) -> Iterator[tuple[Frame, 
         InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
             attention of an exported file is asked for.
     """
-    for argument, given, maker in (("model", model, "load_model"), ("sequence", sequence, "open_sequence")):
-        if isinstance(given, str | Path):
-            raise InputError(f"`{argument}={given}`: is a text or path: pass what `bevcli.{maker}` returns for it")
-    chosen, left = spread(options, StepOptions)
-    refuse(left, "run", StepOptions)
-    shows = chosen.attention or chosen.probes
-    runner = model.in_engine(sequence.rig, sequence, parts="attention and probes" if shows else "").runner(chosen)
+    for argument, value, maker in (("model", model, "load_model"), ("sequence", sequence, "open_sequence")):
+        if isinstance(value, str | Path):
+            raise InputError(f"`{argument}={value}`: is a text or path: pass what `bevcli.{maker}` returns for it")
+    step_options, rest = spread(options, StepOptions)
+    refuse(rest, "run", StepOptions)
+    shows = step_options.attention or step_options.probes
+    runner = model.in_engine(sequence.rig, sequence, parts="attention and probes" if shows else "").runner(step_options)
     return ((frame, prediction) for frame, prediction, _ in runner.run(sequence))
 
 
@@ -105,9 +105,9 @@ class Session:
         check_color_order(color_order)
         if not rig.names or len(set(rig.names)) < len(rig.names):
             raise InputError(f"`rig`: expected cameras with different names (found {', '.join(rig.names) or 'none'})")
-        chosen, left = spread(options, StepOptions)
-        refuse(left, "Session", StepOptions)
-        if chosen.temporal and model.config.later_frames:
+        step_options, rest = spread(options, StepOptions)
+        refuse(rest, "Session", StepOptions)
+        if step_options.temporal and model.config.later_frames:
             raise InputError(
                 f"model {model.name} uses {model.config.later_frames} later frames, which a session does not have: "
                 "choose another model, or pass `temporal=False` (`--no-temporal`)"
@@ -116,7 +116,7 @@ class Session:
         self.name, self.rig, self.notes = name, rig, model.training_notes(rig)
         self.frame: Frame | None = None
         self._color_order = color_order
-        self._runner = model.runner(chosen)
+        self._runner = model.runner(step_options)
         self._state: RunnerState[Any] = RunnerState()
         self._poses = RecentPoses()
         self._meter: Any = None  # of a session without poses
@@ -164,10 +164,10 @@ class Session:
         self._check_all_or_none(world_from_ego is None, world_from_ego_at)
         pose = Pose.identity() if world_from_ego is None else _pose(world_from_ego, "`world_from_ego`")
         poses = self._poses.with_pose(stamp.timestamp_ns, pose)
-        given = (world_from_ego_at or {}).items()
+        known_poses = (world_from_ego_at or {}).items()
         at = {
             name: _pose(world_from_ego_then, f"`world_from_ego_at`: camera {name}")
-            for name, world_from_ego_then in given
+            for name, world_from_ego_then in known_poses
         }
         check_cameras(at, self.rig, "world_from_ego_at")
         frame = Frame(
@@ -237,11 +237,11 @@ class Session:
         return FrameStamp(number, str(self._drive) if self._drive > 1 else "", time)
 
 
-def _pose(given: Pose | ArrayLike, argument: str) -> Pose:
+def _pose(pose: Pose | ArrayLike, argument: str) -> Pose:
     """A pose from what the caller gave. Raises InputError where it is not rigid."""
-    if isinstance(given, Pose):
-        return given
-    matrix = np.asarray(given, dtype=np.float64)
+    if isinstance(pose, Pose):
+        return pose
+    matrix = np.asarray(pose, dtype=np.float64)
     if matrix.shape != (4, 4):
         raise InputError(f"{argument}: expected a Pose or a matrix (4, 4) (found shape {matrix.shape})")
     rotation = matrix[:3, :3]

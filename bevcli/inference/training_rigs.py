@@ -25,8 +25,8 @@ def training_rig_notes(rig: CameraRig, config: ModelConfig) -> tuple[str, ...]:
         if not trained.cameras[0] <= count <= trained.cameras[1]:
             far.append(f"{counted(count, 'cameras')} ({_range(trained.cameras, '')})")
         if min(heights) < trained.height_m[0] - _HEIGHT_M or max(heights) > trained.height_m[1] + _HEIGHT_M:
-            stated = _range(trained.height_m, " m")
-            far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({stated})")
+            trained_range = _range(trained.height_m, " m")
+            far.append(f"camera heights {_range((min(heights), max(heights)), ' m')} ({trained_range})")
         if min(fovs) < trained.fov_deg[0] - _FOV_DEG or max(fovs) > trained.fov_deg[1] + _FOV_DEG:
             far.append(f"fields of view {_range((min(fovs), max(fovs)), '°', 0)} ({_range(trained.fov_deg, '°', 0)})")
         if tilt > trained.tilt_deg + _TILT_DEG:
@@ -73,15 +73,15 @@ def weights_facts(config: ModelConfig) -> dict[str, str]:
 
 def facts_notes(facts: Mapping[str, str], config: ModelConfig) -> Iterator[str]:
     """Warnings where the model's file contradicts the bev frame or the classes that the weights file states."""
-    own = weights_facts(config)
-    if facts.get("classes", own["classes"]) != own["classes"]:
-        names = [listed.strip("[]").replace('"', "") for listed in (facts["classes"], own["classes"])]
+    expected_facts = weights_facts(config)
+    if facts.get("classes", expected_facts["classes"]) != expected_facts["classes"]:
+        names = [listed.strip("[]").replace('"', "") for listed in (facts["classes"], expected_facts["classes"])]
         yield "the weights were trained for the classes {}, but the model's file names {}".format(*names)
-    expected = own["bev_frame"]
-    stated = facts.get("bev_frame", expected)
-    if stated != expected:
+    expected = expected_facts["bev_frame"]
+    frame = facts.get("bev_frame", expected)
+    if frame != expected:
         yield (
-            f'the weights were trained with a bev frame "{stated}", but the model\'s file gives them one "{expected}": '
+            f'the weights were trained with a bev frame "{frame}", but the model\'s file gives them one "{expected}": '
             "set [bev_frame] in the model's file"
         )
 

@@ -118,7 +118,7 @@ def turned_history(history: Tensor, rotation: Tensor, grid: BevGrid) -> Tensor:
     x = torch.arange(columns, device=rotation.device) + 0.5 - columns / 2  # (X,)
     y = torch.arange(rows, device=rotation.device) + 0.5 - rows / 2  # (Y,)
     turned = [by_x[:, i, None, None] * x + by_y[:, i, None, None] * y[:, None] for i in (0, 1)]
-    source_x, source_y = (part + translation[:, i, None, None] for i, part in enumerate(turned))
+    source_x, source_y = (coordinate + translation[:, i, None, None] for i, coordinate in enumerate(turned))
     # The old cell that each cell takes its history from, (B, Y, X) int64 each.
     row = (((source_y + 1) * rows - 1) / 2).round().long()
     column = (((source_x + 1) * columns - 1) / 2).round().long()

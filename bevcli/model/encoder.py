@@ -221,7 +221,7 @@ class SpatialCrossAttention(nn.Module):
         if sampling.sample_hits is not None:
             by_map = Hits(hits.cell, hits.reference_points, hits.hits_per_camera, torch.zeros_like(hits.cell))
             return sampling.sample_hits(self.attention.values(tokens), level_shapes, by_map, *predicted)
-        offsets, logits = (part[:, :, 0] for part in predicted)
+        offsets, logits = (tensor[:, :, 0] for tensor in predicted)
         pillar_points = hits.reference_points.shape[1]
         reference = hits.reference_points.repeat(1, self.points // pillar_points, 1)  # point p: height p mod Z
         offsets, weights = (x.index_select(0, hits.cell) for x in (offsets, sampling.weights(logits)))

@@ -50,11 +50,11 @@ def from_official(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     A key that no rule matches stays unchanged.
     """
     names = _names_of(state)
-    left, unused = names.without_unused(state)
-    left, groups = _first_group(left)
-    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in left)
+    rest, unused = names.without_unused(state)
+    rest, groups = _first_group(rest)
+    first_extra = sum(key.startswith("img_neck.lateral_convs.") and key.endswith(".weight") for key in rest)
     renames = [*names.renames, *_RENAMES]
-    ours = {_our_name(key, first_extra, renames): x for key, x in left.items() if key not in _TRAINING_ONLY}
+    ours = {_our_name(key, first_extra, renames): x for key, x in rest.items() if key not in _TRAINING_ONLY}
     return ours, " and ".join(filter(None, (unused, groups)))
 
 
@@ -81,8 +81,8 @@ def _our_name(key: str, first_extra: int, renames: Renames) -> str:
     output = re.match(r"^img_neck\.fpn_convs\.(\d+)\.conv\.(weight|bias)$", key)
     if output:
         level = int(output[1])
-        part = f"output.{level}" if level < first_extra else f"extra.{level - first_extra}"
-        return f"neck.{part}.{output[2]}"
+        module = f"output.{level}" if level < first_extra else f"extra.{level - first_extra}"
+        return f"neck.{module}.{output[2]}"
     for pattern, replacement in renames:
         key = re.sub(pattern, replacement, key)
     return key

@@ -33,12 +33,12 @@ def model_parts(config: ModelConfig) -> tuple[ModelPart, ...]:
     """All parts of a model, in the order of a frame's way through it. Every parameter belongs to exactly one part."""
     with torch.device("meta"):
         model = build_model(config)
-    left = {name: tuple(parameter.shape) for name, parameter in model.named_parameters()}
+    rest = {name: tuple(parameter.shape) for name, parameter in model.named_parameters()}
     parts = []
     named = list(model.part_names())
-    others = dict.fromkeys(key.split(".")[0] for key in left)  # the modules of a model that names no parts
+    others = dict.fromkeys(key.split(".")[0] for key in rest)  # the modules of a model that names no parts
     for name, *modules in [*named, *((module, module) for module in others)]:
-        of_part = [left.pop(key) for key in tuple(left) if f"{key}.".startswith(tuple(f"{m}." for m in modules))]
+        of_part = [rest.pop(key) for key in tuple(rest) if f"{key}.".startswith(tuple(f"{m}." for m in modules))]
         if of_part:
             shapes = tuple(shape for shape in of_part if len(shape) > 1)
             parts.append(ModelPart(name, tuple(modules), shapes, sum(map(math.prod, of_part))))

@@ -115,9 +115,9 @@ def load_loops(network: nn.Module, dtype: torch.dtype) -> None:
     atexit.register(loading.join, LOADING_TIMEOUT_S)  # Python cannot end in the middle of a compilation
 
 
-def methods_on_device(kind: type) -> list[str]:
+def methods_on_device(cls: type) -> list[str]:
     """Names of the methods of a class that are marked by `on_device`."""
-    return [name for name in dir(kind) if hasattr(getattr(kind, name), "is_on_device")]
+    return [name for name in dir(cls) if hasattr(getattr(cls, name), "is_on_device")]
 
 
 class EfficientNetLiteByImage(EfficientNetLite):
@@ -165,9 +165,9 @@ class TokensInBlocks(ImageTokens):
         tokens = maps[0].new_empty(images, sum(x.shape[1] for x in levels), channels)
         parts = tokens.split([x.shape[1] for x in levels], dim=1)
         of_cameras = () if self.camera_embedding is None else self.camera_embedding[camera_index].view(-1, channels)
-        for level, part, embedding in zip(levels, parts, self.level_embedding, strict=False):
+        for level, output, embedding in zip(levels, parts, self.level_embedding, strict=False):
             for image in range(images):
-                blocks = (x[image].split(TOKENS_OF_A_BLOCK) for x in (level, part))
+                blocks = (x[image].split(TOKENS_OF_A_BLOCK) for x in (level, output))
                 for block, result in zip(*blocks, strict=True):
                     block = block + embedding
                     if len(of_cameras):

@@ -58,7 +58,7 @@ def unpacked(memory: Tensor, like: Sequence[Tensor]) -> list[Tensor]:
     order = _order(like)
     parts = memory.split([like[index].nbytes for index in order])
     by_index = {
-        index: part.view(like[index].dtype).view(like[index].shape) for index, part in zip(order, parts, strict=True)
+        index: chunk.view(like[index].dtype).view(like[index].shape) for index, chunk in zip(order, parts, strict=True)
     }
     return [by_index[index] for index in range(len(like))]
 
@@ -83,11 +83,11 @@ def tensors_in(value: object, name: str = "") -> Iterator[tuple[str, Tensor]]:
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple | list):
-        for part in value:
-            yield from tensors_in(part, name)
+        for item in value:
+            yield from tensors_in(item, name)
     else:
-        kind: Any = type(value)
-        for field in _fields_of(kind):
+        cls: Any = type(value)
+        for field in _fields_of(cls):
             yield from tensors_in(getattr(value, field), field)
 
 
@@ -96,13 +96,13 @@ def exchanged(value: Any, others: Iterator[Any]) -> Any:
     if isinstance(value, Tensor):
         return next(others)
     if isinstance(value, tuple | list):
-        return type(value)(exchanged(part, others) for part in value)
-    kind: Any = type(value)
-    names = _fields_of(kind)
+        return type(value)(exchanged(item, others) for item in value)
+    cls: Any = type(value)
+    names = _fields_of(cls)
     return replace(value, **{name: exchanged(getattr(value, name), others) for name in names}) if names else value
 
 
 @cache
-def _fields_of(kind: Any) -> tuple[str, ...]:
+def _fields_of(cls: Any) -> tuple[str, ...]:
     """Of a dataclass; () for another type. They are kept: asking a dataclass takes longer than copying a tensor."""
-    return tuple(field.name for field in fields(kind)) if is_dataclass(kind) else ()
+    return tuple(field.name for field in fields(cls)) if is_dataclass(cls) else ()

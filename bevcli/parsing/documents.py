@@ -75,8 +75,8 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
             json.dumps(document, ensure_ascii=False, default=vars).encode()
         return document
     except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{path}: {where}: broken JSON: {error.msg}") from None
+        position = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{path}: {position}: broken JSON: {error.msg}") from None
     except UnicodeError as error:
         raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
     except RecursionError:

@@ -47,13 +47,13 @@ def encode_image(pixels: NDArray, ending: str = ".jpg", quality: int = JPEG_QUAL
 
 def size_of_image(encoded: bytes) -> tuple[int, int] | None:
     """(width, height) in pixels as the header of an image file states it; None where it states none."""
-    kind = media_type_of(encoded)
-    if kind == "image/png":
+    media_type = media_type_of(encoded)
+    if media_type == "image/png":
         if len(encoded) < 24 or encoded[12:16] != b"IHDR":
             return None
         width, height = struct.unpack(">II", encoded[16:24])
         return width, height
-    if kind == "image/jpeg":
+    if media_type == "image/jpeg":
         for marker, offset in _jpeg_markers(encoded):
             if marker in _FRAMES and offset + 7 <= len(encoded):
                 height, width = struct.unpack(">HH", encoded[offset + 3 : offset + 7])
@@ -81,10 +81,10 @@ def _is_cut_short(encoded: bytes) -> bool:
 
     Bytes after the end, such as the video of a motion photo, do not matter.
     """
-    kind = media_type_of(encoded)
-    if kind == "image/jpeg":
+    media_type = media_type_of(encoded)
+    if media_type == "image/jpeg":
         return _END not in (marker for marker, _ in _jpeg_markers(encoded))  # a thumbnail's end lies in its segment
-    if kind is None:
+    if media_type is None:
         return False  # OpenCV refuses those of the other formats
     offset = 8
     while offset + 12 <= len(encoded):  # a chunk of a PNG: length, kind, contents, checksum

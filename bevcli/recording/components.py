@@ -35,13 +35,13 @@ def components(archetype: Any, **fields: Any) -> Components:
     row: Components = {}
     for name, value in fields.items():
         if value is not None:
-            descriptor, kind = _field(archetype, name)
+            descriptor, arrow_type = _field(archetype, name)
             if isinstance(value, pa.Array):
                 row[descriptor] = value
             elif isinstance(value, np.ndarray):
-                row[descriptor] = _numbers(value, kind)
-            elif isinstance(value, list) and pa.types.is_string(kind):
-                row[descriptor] = pa.array(value, kind)
+                row[descriptor] = _numbers(value, arrow_type)
+            elif isinstance(value, list) and pa.types.is_string(arrow_type):
+                row[descriptor] = pa.array(value, arrow_type)
             else:
                 row[descriptor] = _constant(archetype, name, value)
     return row
@@ -66,15 +66,15 @@ def ui_points(width: float) -> pa.Array:
 
 def line_strips(points: Array, lengths: Sequence[int]) -> pa.Array:
     """Strips, each with a number of points of its own. points: (P, 2 or 3) of all of them, one after the other."""
-    _, kind = _field(rr.LineStrips2D if points.shape[1] == 2 else rr.LineStrips3D, "strips")
-    return _lists(points, np.cumsum([0, *lengths], dtype=np.int32), kind)
+    _, arrow_type = _field(rr.LineStrips2D if points.shape[1] == 2 else rr.LineStrips3D, "strips")
+    return _lists(points, np.cumsum([0, *lengths], dtype=np.int32), arrow_type)
 
 
 @lru_cache(maxsize=64)
 def rgb_format(width: int, height: int) -> pa.Array:
     """The format of an image (height, width, 3) of bytes, RGB."""
-    kind = rr.components.ImageFormat(width=width, height=height, channel_datatype="U8", color_model="RGB")
-    return rr.components.ImageFormatBatch(kind).as_arrow_array()
+    image_format = rr.components.ImageFormat(width=width, height=height, channel_datatype="U8", color_model="RGB")
+    return rr.components.ImageFormatBatch(image_format).as_arrow_array()
 
 
 @cache
@@ -89,23 +89,23 @@ def _constant(archetype: Any, name: str, value: Hashable) -> pa.Array:
     return batch.as_arrow_array()
 
 
-def _numbers(value: NDArray[Any], kind: pa.DataType) -> pa.Array:
-    if pa.types.is_uint32(kind) and value.dtype == np.uint8:
+def _numbers(value: NDArray[Any], arrow_type: pa.DataType) -> pa.Array:
+    if pa.types.is_uint32(arrow_type) and value.dtype == np.uint8:
         return pa.array(packed(value))
-    if pa.types.is_list(kind):  # strips (N, points, 2 or 3), or the bytes (N,) of a file or an image
+    if pa.types.is_list(arrow_type):  # strips (N, points, 2 or 3), or the bytes (N,) of a file or an image
         if value.ndim == 1:
-            return _lists(value, np.array([0, len(value)], np.int32), kind)
+            return _lists(value, np.array([0, len(value)], np.int32), arrow_type)
         offsets = np.arange(len(value) + 1, dtype=np.int32) * np.int32(value.shape[1])
-        return _lists(value.reshape(-1, value.shape[2]), offsets, kind)
-    is_vector = pa.types.is_fixed_size_list(kind)
-    of_number = (kind.value_type if is_vector else kind).to_pandas_dtype()
+        return _lists(value.reshape(-1, value.shape[2]), offsets, arrow_type)
+    is_vector = pa.types.is_fixed_size_list(arrow_type)
+    of_number = (arrow_type.value_type if is_vector else arrow_type).to_pandas_dtype()
     numbers = pa.array(value.reshape(-1).astype(of_number, copy=False))
-    return pa.FixedSizeListArray.from_arrays(numbers, type=kind) if is_vector else numbers
+    return pa.FixedSizeListArray.from_arrays(numbers, type=arrow_type) if is_vector else numbers
 
 
-def _lists(rows: NDArray[Any], offsets: NDArray[np.int32], kind: pa.DataType) -> pa.Array:
+def _lists(rows: NDArray[Any], offsets: NDArray[np.int32], arrow_type: pa.DataType) -> pa.Array:
     """Lists of consecutive rows: numbers, or vectors (N, 2 or 3)."""
-    return pa.ListArray.from_arrays(pa.array(offsets), _numbers(rows, kind.value_type), type=kind)
+    return pa.ListArray.from_arrays(pa.array(offsets), _numbers(rows, arrow_type.value_type), type=arrow_type)
 
 
 def packed(colors: NDArray[np.uint8]) -> NDArray[np.uint32]:

@@ -70,12 +70,12 @@ def false_and_duplicate(predictions: Boxes3D, ground_truth: Boxes3D | None) -> M
     marked = none if predictions.duplicates is None else predictions.duplicates
     if ground_truth is None:
         return Marks(none, marked, np.zeros(0, dtype=bool))
-    true, found = true_positives(predictions, ground_truth)
-    truths = ground_truth[found]
+    true, is_found = true_positives(predictions, ground_truth)
+    truths = ground_truth[is_found]
     away = np.linalg.norm(predictions.centers[:, None, :2] - truths.centers[:, :2], axis=-1)  # (N, M)
     near = (away < MATCH_DISTANCE_M) & (predictions.classes[:, None] == truths.classes)
     duplicate = ~true & (marked | near.any(-1))
-    return Marks(~true & ~duplicate, duplicate, found)
+    return Marks(~true & ~duplicate, duplicate, is_found)
 
 
 def marks_within(
@@ -132,13 +132,13 @@ def log_boxes_3d(
     columns = {column.recorded: getattr(boxes, name) for name, column in OPTIONAL_COLUMNS.items() if column.recorded}
     if boxes.scores is None:
         columns[OPTIONAL_COLUMNS["scores"].recorded] = np.ones(len(boxes))
-    facts = any_values(
+    details = any_values(
         velocity_x=boxes.velocities[:, 0],
         velocity_y=boxes.velocities[:, 1],
         name=boxes.classes,
         **{name: values for name, values in columns.items() if values is not None},
     )
-    log(stream, entities.BOXES, row | facts)
+    log(stream, entities.BOXES, row | details)
     moving = np.linalg.norm(boxes.velocities, axis=-1) > MOVING_M_S
     arrows = components(
         rr.Arrows3D,
@@ -194,31 +194,31 @@ def other_classes(truth: Boxes3D, classes: Iterable[str]) -> np.ndarray:
     return ~np.isin(truth.classes, list(classes))
 
 
-def ground_truth_colors(found: np.ndarray, other: np.ndarray) -> np.ndarray:
+def ground_truth_colors(is_found: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(M, 3) uint8 colours of ground-truth boxes: pale where found, red where missed, grey for other classes.
 
     found: (M,) bool. other: (M,) bool, classes that are not among the model's.
     """
-    colors = np.where(found[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
+    colors = np.where(is_found[:, None], entities.GROUND_TRUTH_COLOR, entities.MISSED_COLOR)
     return np.where(other[:, None], entities.OTHER_COLOR, colors).astype(np.uint8).reshape(-1, 3)
 
 
 def log_ground_truth(
-    stream: rr.RecordingStream, in_world: Boxes3D, corners_bev: Array, found: np.ndarray, colors: np.ndarray
+    stream: rr.RecordingStream, in_world: Boxes3D, corners_bev: Array, is_found: np.ndarray, colors: np.ndarray
 ) -> None:
     """Write ground-truth boxes into the scene and into the BEV view; found and missed ones are two entities.
 
     in_world: M in the recording's world. corners_bev: (M, 8, 3) in the bev frame. found: (M,) bool. colors: (M, 3)
     uint8.
     """
-    pale = np.insert(colors[found], 3, 150, axis=1)
-    for entity, entity_bev, chosen, color in (
-        (entities.GROUND_TRUTH, entities.BEV_GROUND_TRUTH, found, pale),
-        (entities.MISSED, entities.BEV_MISSED, ~found, entities.MISSED_COLOR),
+    pale = np.insert(colors[is_found], 3, 150, axis=1)
+    for entity, entity_bev, selection, color in (
+        (entities.GROUND_TRUTH, entities.BEV_GROUND_TRUTH, is_found, pale),
+        (entities.MISSED, entities.BEV_MISSED, ~is_found, entities.MISSED_COLOR),
     ):
-        boxes, strips = in_world[chosen], footprints(corners_bev[chosen])
+        boxes, strips = in_world[selection], footprints(corners_bev[selection])
         log(stream, entity, _solid(boxes, colors=color, radii=THIN) | any_values(name=boxes.classes))
-        doubled = np.tile(np.insert(colors[chosen], 3, 200, axis=1), (2, 1))
+        doubled = np.tile(np.insert(colors[selection], 3, 200, axis=1), (2, 1))
         log(stream, entity_bev, components(rr.LineStrips2D, strips=strips, colors=doubled, radii=THIN, draw_order=20))
 
 
@@ -275,12 +275,12 @@ def log_ego_on_map(stream: rr.RecordingStream, origin: GeoOrigin, here: Array, b
 
     here, before: (3,) in the sequence's world frame, metres; before is None in the first frame of a scene.
     """
-    place = origin.latitude_longitude(here)
+    point = origin.latitude_longitude(here)
     stream.log(
-        entities.MAP_EGO, rr.GeoPoints(lat_lon=[place], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
+        entities.MAP_EGO, rr.GeoPoints(lat_lon=[point], radii=rr.Radius.ui_points(7.0), colors=entities.EGO_COLOR)
     )
     if before is not None:
-        way = [origin.latitude_longitude(before), place]
+        way = [origin.latitude_longitude(before), point]
         line = rr.GeoLineStrings(lat_lon=[way], radii=rr.Radius.ui_points(2.0), colors=entities.EGO_COLOR)
         stream.log(entities.MAP_ROUTE, line)
 

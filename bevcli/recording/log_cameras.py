@@ -115,13 +115,13 @@ def cut_to_images(
     for i, posed in enumerate(cameras):
         if posed.camera.distortion is not None:
             own_ends[i], own_owners[i] = _cut(own_ends[i]), np.repeat(own_owners[i], PIECES_PER_EDGE)
-    pixels = [posed.camera.project(own)[0] for posed, own in zip(cameras, own_ends, strict=True)]
-    lengths = [len(own) for own in pixels]
+    pixels = [posed.camera.project(ends)[0] for posed, ends in zip(cameras, own_ends, strict=True)]
+    lengths = [len(points) for points in pixels]
     sizes = np.repeat([(posed.camera.width, posed.camera.height) for posed in cameras], lengths, axis=0)
     segments, inside = clip_to_image(np.concatenate(pixels), *sizes.T)
     ends_of_cameras = np.cumsum(lengths)[:-1]
     parts = zip(*(np.split(whole, ends_of_cameras) for whole in (segments, inside)), own_owners, strict=True)
-    return [ImageLines(own[shown], owner[shown]) for own, shown, owner in parts]
+    return [ImageLines(points[shown], owner[shown]) for points, shown, owner in parts]
 
 
 def clip_near(ends: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -244,7 +244,7 @@ def log_boxes_in_images(
     stream: rr.RecordingStream, cameras: Sequence[PosedCamera], layers: Sequence[ImageLayer]
 ) -> None:
     """Draws boxes, and the labels of those that have some, into the images. Layers with labels come first."""
-    corners, colors = (np.concatenate([getattr(layer, part) for layer in layers]) for part in ("corners", "colors"))
+    corners, colors = (np.concatenate([getattr(layer, name) for layer in layers]) for name in ("corners", "colors"))
     texts = [text for layer in layers for text in layer.texts or ()]
     starts = np.cumsum([0, *(len(layer.corners) for layer in layers)])
     for posed, lines in zip(cameras, lines_in_images(corners, cameras), strict=True):
@@ -253,16 +253,16 @@ def log_boxes_in_images(
         predicted = ImageLines(lines.segments[:labelled], lines.owners[:labelled])
         positions, owners = labels_in_image(predicted, texts, camera.width, camera.height)
         for i, layer in enumerate(layers):
-            part, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, layer.kind)
-            segments, line_colors, radii = lines.segments[part], colors[lines.owners[part]], ui_points(layer.width)
+            rows, entity = slice(ends[i], ends[i + 1]), entities.overlay(camera.name, layer.kind)
+            segments, line_colors, radii = lines.segments[rows], colors[lines.owners[rows]], ui_points(layer.width)
             strips = components(
                 rr.LineStrips2D, strips=segments, colors=line_colors, radii=radii, draw_order=layer.order
             )
             log(stream, entity, strips)
             if layer.texts is not None:
-                chosen = (owners >= starts[i]) & (owners < starts[i + 1])
-                names, label_colors = [texts[owner] for owner in owners[chosen]], colors[owners[chosen]]
-                labels = labels_2d(positions[chosen], names, colors=label_colors, draw_order=layer.order + 1)
+                selection = (owners >= starts[i]) & (owners < starts[i + 1])
+                names, label_colors = [texts[owner] for owner in owners[selection]], colors[owners[selection]]
+                labels = labels_2d(positions[selection], names, colors=label_colors, draw_order=layer.order + 1)
                 log(stream, f"{entity}/labels", labels)
 
 

@@ -72,10 +72,10 @@ def fit_colors(kind: str, features: Features) -> BevColors:
         # The sign of an eigenvector is arbitrary: make its largest entry positive.
         basis = basis * np.where(signs == 0, 1, signs).astype(np.float32)
     elif kind.startswith("channel:"):
-        chosen = int(kind.partition(":")[2])
-        if chosen >= channels:
+        channel = int(kind.partition(":")[2])
+        if channel >= channels:
             raise InputError(f"`bev={kind}` (`--bev`): the BEV map has channels 0 to {channels - 1}")
-        basis = np.eye(channels, dtype=np.float32)[:, chosen : chosen + 1]
+        basis = np.eye(channels, dtype=np.float32)[:, channel : channel + 1]
     low, high = np.percentile(_values(features, mean, basis), PERCENTILES, axis=0)
     return BevColors(mean, basis, low, high)
 
@@ -213,8 +213,8 @@ def log_ground_lines(
     parts = log_cameras.cut_to_images(of_cameras, np.tile(owners, len(cameras)), counts, cameras)
     own_colors = np.array(lines.colors, dtype=np.uint8).reshape(-1, 4)
     for posed, visible in zip(cameras, parts, strict=True):
-        own = own_colors[visible.owners]
-        strips = components(rr.LineStrips2D, strips=visible.segments, colors=own, radii=radii, draw_order=15)
+        line_colors = own_colors[visible.owners]
+        strips = components(rr.LineStrips2D, strips=visible.segments, colors=line_colors, radii=radii, draw_order=15)
         log(stream, entities.overlay(posed.camera.name, kind), strips)
 
 

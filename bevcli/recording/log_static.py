@@ -237,7 +237,7 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     for kind, entries in (("line", dict(line_entries(recorded.config))), ("layer", recorded.layers)):
         if entries:
             of_map |= {f"{kind}_names": list(entries), f"{kind}_colors": list(map(hex_of_color, entries.values()))}
-    facts = rr.AnyValues(
+    details = rr.AnyValues(
         title=title,
         untrained=untrained,
         note=recorded.note,
@@ -256,7 +256,7 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     if files is not None and len(files.names) != 1:
         how = TWO_MODELS if files.names else LABELS_ALONE
     page = rr.TextDocument(f"# {title}\n\n{warning}{summary}\n{how}", media_type="text/markdown")
-    stream.log(entities.RUN, page, facts, static=True)
+    stream.log(entities.RUN, page, details, static=True)
     legend = legend_entries(recorded)
     rows = -(-len(legend) // LEGEND_COLUMNS)
     spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(legend))])
@@ -342,5 +342,5 @@ def line_entries(config: ModelConfig | None) -> list[tuple[str, Color]]:
     """The texts and colours of the lines on the ground that a model finds; none without a model."""
     if config is None:
         return []
-    of_results = [entry for kind, names in config.results.items() for entry in kind.legend(names).items()]
+    of_results = [entry for cls, names in config.results.items() for entry in cls.legend(names).items()]
     return [*of_results, *([("futures: colour of the box", entities.TEXT_COLOR)] if config.future_times_s else [])]

@@ -32,7 +32,7 @@ def write_parts(path: str, *color: str) -> str | None:
     try:
         corners, normals, faces, colors = zip(*read_parts(Path(path), tuple(map(int, color))), strict=True)
         starts = np.cumsum([0, *map(len, corners[:-1])])
-        shifted = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
+        shifted = np.concatenate([indices + start for indices, start in zip(faces, starts, strict=True)])
         for array in (np.concatenate(corners), np.concatenate(normals), shifted, np.concatenate(colors)):
             np.save(sys.stdout.buffer, array)
     except InputError as error:

@@ -86,7 +86,7 @@ class RecordingState:
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Poses:
     """The frames of reference of one frame's boxes.
 
     Attributes:
@@ -228,12 +228,12 @@ class Recording:
         self.file.append(memoryview(content)[entities.FILE_HEADER if self.file.size else 0 : end])
         self._kept.size = self.file.size
 
-    def log(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+    def log(self, frame: Frame, predicted: Prediction | FileBoxes) -> None:
         """Writes one frame: images, shown boxes, ground truth, curves, events and the model's internals.
 
         found: by the model, or without one the boxes of each file, in the world frame; None where it lacks the frame.
         """
-        prediction = found if isinstance(found, Prediction) else None
+        prediction = predicted if isinstance(predicted, Prediction) else None
         stream, is_first = self._stream, self._kept.world_from_ego is None
         if self._kept.origin is None:  # the recording's world frame has its origin at the first frame's ego position
             self._kept.origin = frame.world_from_ego.matrix[:3, 3].copy()
@@ -241,9 +241,9 @@ class Recording:
         self._at(frame.stamp)
         moved = rigid(-self._kept.origin)  # from the sequence's world into the recording's world
         if prediction is not None:
-            place = _Place(moved, prediction.world_from_ego, prediction.ego_from_bev)
+            frame_poses = _Poses(moved, prediction.world_from_ego, prediction.ego_from_bev)
         else:
-            place = _Place(moved, frame.world_from_ego, frame.rig.ego_from_bev)
+            frame_poses = _Poses(moved, frame.world_from_ego, frame.rig.ego_from_bev)
         self._log_ego(frame, moved)
         poses = [moved @ frame.world_from_ego_at[c.name].matrix @ c.ego_from_camera for c in frame.rig.cameras]
         cameras = tuple(
@@ -253,7 +253,7 @@ class Recording:
             name = posed.camera.name
             log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
             self._images.log(name, frame.images.get(name))
-        self._log_boxes(frame, found, place, cameras)
+        self._log_boxes(frame, predicted, frame_poses, cameras)
         if is_first:
             counted = self._recorded.layers or self._recorded.classes
             lines = rr.SeriesLines(names=list(counted), colors=list(counted.values()))
@@ -261,7 +261,7 @@ class Recording:
             stream.log(entities.SPEED_CURVE, rr.SeriesLines(names="km/h", colors=entities.EGO_COLOR), static=True)
         if prediction is not None:
             if self._recorded.results:
-                self._log_results(prediction, place, cameras)
+                self._log_results(prediction, frame_poses, cameras)
             if self._recorded.config is not None and self._recorded.config.image_classes:
                 found_in = prediction.image_boxes or {}
                 shown = {name: boxes.scored(self._options.score) for name, boxes in found_in.items()}
@@ -270,9 +270,9 @@ class Recording:
             self._log_stages(prediction, is_first=is_first)
         elif self._recorded.map_classes:
             self._log_map(frame.ground_truth_map, frame.rig.ego_from_bev)
-        self._log_events(frame, found)
+        self._log_events(frame, predicted)
         if prediction is not None and self._options.shows_internals:
-            self._log_internals(frame, prediction, place.world_from_bev, cameras)
+            self._log_internals(frame, prediction, frame_poses.world_from_bev, cameras)
         self._kept.scene, self._kept.world_from_ego = frame.stamp.scene, frame.world_from_ego
         self._write()
 
@@ -320,80 +320,80 @@ class Recording:
             line = components(rr.LineStrips3D, strips=way, colors=entities.EGO_COLOR, radii=0.06)
             log(stream, entities.TRAJECTORY, line)
 
-    def _log_boxes(self, frame: Frame, found: Prediction | FileBoxes, place: _Place, cameras: PosedCameras) -> None:
+    def _log_boxes(self, frame: Frame, predicted: Prediction | FileBoxes, poses: _Poses, cameras: PosedCameras) -> None:
         """Writes the boxes and the ground truth of a frame."""
         recorded, files = self._recorded, self._recorded.files
-        if isinstance(found, Prediction):
-            sides, grid = [found.boxes], found.grid
+        if isinstance(predicted, Prediction):
+            sides, grid = [predicted.boxes], predicted.grid
         else:
-            sides, grid = [place.in_bev(boxes) if boxes else NO_BOXES for boxes in found], None
+            sides, grid = [poses.in_bev(boxes) if boxes else NO_BOXES for boxes in predicted], None
         sides = [boxes.scored(self._options.score) for boxes in sides]
-        truth = None if frame.ground_truth is None else place.in_bev(frame.ground_truth)
+        truth = None if frame.ground_truth is None else poses.in_bev(frame.ground_truth)
         truth = None if truth is None else log_boxes.detectable(truth, grid)
         if files is not None and not files.names:  # labels alone are drawn as boxes
             sides, truth = [truth or NO_BOXES], None
         marks = log_boxes.false_and_duplicate(sides[0], None)
         missed = np.zeros(0 if truth is None else len(truth), dtype=bool)
-        is_known = isinstance(found, Prediction) or all(boxes is not None for boxes in found)
+        is_known = isinstance(predicted, Prediction) or all(boxes is not None for boxes in predicted)
         # Random boxes match nothing: a scene all in red would be useless.
         if truth is not None and is_known and not recorded.layers and not recorded.model.untrained:
-            marks = self._marks(sides[0], truth, place)
+            marks = self._marks(sides[0], truth, poses)
             missed = ~marks.found & ~log_boxes.other_classes(truth, recorded.classes)
         if recorded.layers:
-            drawn = [self._log_layer(*layer, place) for layer in zip(recorded.layers.items(), sides, strict=True)]
+            drawn = [self._log_layer(*layer, poses) for layer in zip(recorded.layers.items(), sides, strict=True)]
             none = log_boxes.false_and_duplicate(NO_BOXES, None)
             log_boxes.log_boxes_3d(self._stream, NO_BOXES, np.zeros((0, 8, 3)), none, {}, [])
             counts = list(map(len, sides))
         else:
-            drawn = [self._log_shown(frame.stamp, sides[0], marks, place)]
+            drawn = [self._log_shown(frame.stamp, sides[0], marks, poses)]
             counts = [(sides[0].classes == name).sum() for name in recorded.classes]
         if truth is not None:
-            drawn.append(self._log_truth(truth, missed, place))
+            drawn.append(self._log_truth(truth, missed, poses))
         log_cameras.log_boxes_in_images(self._stream, cameras, drawn)
         log(self._stream, entities.BOX_CURVES, components(rr.Scalars, scalars=np.array(counts)))
 
-    def _marks(self, shown: Boxes3D, truth: Boxes3D, place: _Place) -> log_boxes.Marks:
+    def _marks(self, shown: Boxes3D, truth: Boxes3D, poses: _Poses) -> log_boxes.Marks:
         """The marks of boxes, both in the bev frame: of a model all over its grid, of a file where it is scored."""
         files = self._recorded.files
         if files is None:
             return log_boxes.false_and_duplicate(shown, truth)
-        return log_boxes.marks_within(shown, truth, *(place.within(side, files.ranges_m) for side in (shown, truth)))
+        return log_boxes.marks_within(shown, truth, *(poses.within(side, files.ranges_m) for side in (shown, truth)))
 
-    def _log_truth(self, truth: Boxes3D, missed: NDArray[np.bool_], place: _Place) -> ImageLayer:
+    def _log_truth(self, truth: Boxes3D, missed: NDArray[np.bool_], poses: _Poses) -> ImageLayer:
         """Writes ground truth (M, bev frame) into the scene and the BEV view; returns its drawing in the images."""
         other = log_boxes.other_classes(truth, self._recorded.classes)
-        in_world, colors = truth.transformed(place.world_from_bev), log_boxes.ground_truth_colors(~missed, other)
+        in_world, colors = truth.transformed(poses.world_from_bev), log_boxes.ground_truth_colors(~missed, other)
         log_boxes.log_ground_truth(self._stream, in_world, truth.corners(), ~missed, colors)
         return ImageLayer("ground_truth", in_world.corners(), colors, width=0.6, order=20)
 
-    def _log_layer(self, layer: tuple[str, Color], shown: Boxes3D, place: _Place) -> ImageLayer:
+    def _log_layer(self, layer: tuple[str, Color], shown: Boxes3D, poses: _Poses) -> ImageLayer:
         """Writes the boxes of one of two models, a name and a colour; returns their drawing in the images."""
-        (name, color), in_world = layer, shown.transformed(place.world_from_bev)
+        (name, color), in_world = layer, shown.transformed(poses.world_from_bev)
         texts = log_cameras.box_labels(shown)
-        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE // 2)
+        labels = poses.labels(shown, texts, log_boxes.LABELS_IN_SCENE // 2)
         log_boxes.log_layer(self._stream, name, in_world, shown.corners(), color, labels)
         colors = np.tile(np.array(color, np.uint8), (len(shown), 1))
         return ImageLayer(entities.layer("", name)[1:], in_world.corners(), colors, texts)
 
-    def _log_shown(self, stamp: FrameStamp, shown: Boxes3D, marks: log_boxes.Marks, place: _Place) -> ImageLayer:
+    def _log_shown(self, stamp: FrameStamp, shown: Boxes3D, marks: log_boxes.Marks, poses: _Poses) -> ImageLayer:
         """Writes the boxes (N, bev frame) of one model, or labels alone; returns their drawing in the images."""
         stream, classes = self._stream, self._recorded.classes
-        in_world, colors = shown.transformed(place.world_from_bev), log_boxes.box_colors(shown, classes)
+        in_world, colors = shown.transformed(poses.world_from_bev), log_boxes.box_colors(shown, classes)
         files = self._recorded.files
         is_label = files is not None and not files.names  # the names of labelled objects are long
         corners, texts = (
             in_world.corners(),
             log_cameras.box_labels(replace(shown, instances=None) if is_label else shown),
         )
-        labels = place.labels(shown, texts, log_boxes.LABELS_IN_SCENE)
+        labels = poses.labels(shown, texts, log_boxes.LABELS_IN_SCENE)
         log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
         for name in self._with_meshes:
             log_boxes.log_class_mesh(stream, name, in_world[in_world.classes == name])
         log_boxes.log_boxes_bev(stream, shown, shown.corners(), marks, colors)
-        bev_from_world = inverse(place.world_from_bev)
+        bev_from_world = inverse(poses.world_from_bev)
         log_boxes.log_tracks(stream, self._kept.tracks, in_world, corners, colors, stamp, bev_from_world)
         if self._geo_origin is not None:
-            centers = apply(place.pose.matrix @ place.ego_from_bev, shown.centers)
+            centers = apply(poses.pose.matrix @ poses.ego_from_bev, shown.centers)
             log_boxes.log_boxes_on_map(stream, self._geo_origin, centers, colors if len(shown) else None)
         return ImageLayer("boxes", corners, colors, texts)
 
@@ -406,34 +406,34 @@ class Recording:
         seconds = np.array(list(prediction.stage_seconds.values()))
         log(self._stream, entities.STAGE_CURVES, components(rr.Scalars, scalars=seconds))
 
-    def _log_results(self, prediction: Prediction, place: _Place, cameras: PosedCameras) -> None:
+    def _log_results(self, prediction: Prediction, poses: _Poses, cameras: PosedCameras) -> None:
         """Writes the results and futures of a model that has further results."""
-        score, world_from_bev = self._options.score, place.world_from_bev
-        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(place.moved @ place.pose.matrix))
-        for kind, names in self._recorded.results.items():
-            result = result_of(kind, prediction.results)
+        score, world_from_bev = self._options.score, poses.world_from_bev
+        ground = replace(prediction.ground, world_from_ego=Pose.from_matrix(poses.moved @ poses.pose.matrix))
+        for cls, names in self._recorded.results.items():
+            result = result_of(cls, prediction.results)
             lines = GroundLines() if result is None else result.drawn(ground, names, score)
-            log_ground_lines(self._stream, kind.kind, lines, world_from_bev, cameras)
+            log_ground_lines(self._stream, cls.kind, lines, world_from_bev, cameras)
         shown = prediction.boxes.scored(score).transformed(world_from_bev)
         futures = future_lines(shown, self._recorded.classes)
         log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 
-    def _log_events(self, frame: Frame, found: Prediction | FileBoxes) -> None:
+    def _log_events(self, frame: Frame, predicted: Prediction | FileBoxes) -> None:
         if self._kept.world_from_ego is None and self._recorded.note in log_static.WARNINGS:
             self.event(log_static.WARNINGS[self._recorded.note], "WARN")
         name = f"frame {frame.stamp.index}"
         while self._early_events:
             self.event(*self._early_events.pop(0))
-        if isinstance(found, Prediction) and found.started_anew:
+        if isinstance(predicted, Prediction) and predicted.started_anew:
             scene = f', scene "{frame.stamp.scene}"' if frame.stamp.scene else ""
-            self.event(f"{name}: no history: {found.started_anew}{scene}")
+            self.event(f"{name}: no history: {predicted.started_anew}{scene}")
         for camera, reason in frame.dropped.items():
             self.event(f"{name}: camera {camera} has no image: {reason}", "WARN")
-        if isinstance(found, Prediction):
-            if found.failure:
-                self.event(f"{name}: {found.failure}", "ERROR" if found.not_finite else "WARN")
+        if isinstance(predicted, Prediction):
+            if predicted.failure:
+                self.event(f"{name}: {predicted.failure}", "ERROR" if predicted.not_finite else "WARN")
             return
-        for file, boxes in zip(self._recorded.files.names if self._recorded.files else (), found, strict=True):
+        for file, boxes in zip(self._recorded.files.names if self._recorded.files else (), predicted, strict=True):
             if boxes is None:
                 self.event(f"{name}: {file} does not have this frame", "WARN")
 

@@ -14,7 +14,7 @@ from bevcli.frame import Drive, FrameStamp
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, rotation_from_quaternion
-from bevcli.rig import mistakes, rig_checks
+from bevcli.rig import rig_checks
 
 BEV_ASSUMED = Finding(
     "bev-assumed", "info", None, 'the calibration has no "ego_from_bev"',
@@ -60,7 +60,13 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     poses, swapped, bev = list[Finding](), list[Finding](), list[Finding]()
     wrong = {finding.camera for finding in errors_of(found_before)}
     cameras = [camera for camera in rig.cameras if camera.name not in wrong]
-    if any(map(rig_checks.pose_defects, cameras)):
+    has_defects, has_bev = (
+        any(map(rig_checks.pose_defects, cameras)),
+        rig_checks.is_plausible_bev_frame(rig.ego_from_bev),
+    )
+    if has_defects or not has_bev:
+        from bevcli.rig import mistakes  # explains what a sound rig does not have
+    if has_defects:
         poses = mistakes.pose_errors(cameras)
         # Swapped names of cameras whose poses share another mistake, such as all inverted, are seen once it is undone.
         swapped = [
@@ -71,7 +77,7 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     badly_posed = {finding.camera for finding in poses}
     names = rig_checks.check_names([camera for camera in cameras if camera.name not in badly_posed])
     if None not in wrong:
-        if rig_checks.is_plausible_bev_frame(rig.ego_from_bev):
+        if has_bev:
             bev = rig_checks.bev_warnings(rig.ego_from_bev)
         else:
             bev = [mistakes.bev_frame_error(rig.ego_from_bev)]
@@ -145,9 +151,9 @@ def check_ego_motion(ego_motion: EgoMotion) -> tuple[Finding, ...]:
     findings += _direction(drive)
     moving = speeds > MIN_MOVING_SPEED
     if not findings and ego_motion.velocities_are_stated and moving.any():
-        stated = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
-        if not 1 / SPEED_FACTOR <= float(np.median(stated / speeds[moving])) <= SPEED_FACTOR:
-            found = f"stated {np.median(stated):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
+        stated_speeds = np.linalg.norm((ego_motion.velocities[:-1] + ego_motion.velocities[1:]) / 2, axis=1)[moving]
+        if not 1 / SPEED_FACTOR <= float(np.median(stated_speeds / speeds[moving])) <= SPEED_FACTOR:
+            found = f"stated {np.median(stated_speeds):.1f} m/s, from the poses {np.median(speeds[moving]):.1f} m/s"
             message, advice = "the stated speed does not fit the poses", "give vx, vy, vz in m/s, or leave them out"
             expected = f"equal within a factor of {SPEED_FACTOR:g}"
             findings.append(Finding("ego-speed", "error", None, message, found, expected, advice))
@@ -159,7 +165,7 @@ def check_scenes(ego_motion: EgoMotion, stamps: Sequence[FrameStamp]) -> tuple[F
     changes = [(a.timestamp_ns + b.timestamp_ns) // 2 for a, b in pairwise(stamps) if a.scene != b.scene]
     times = ego_motion.timestamps_ns
     rows = np.split(np.arange(len(times)), np.searchsorted(times, np.sort(np.array(changes, dtype=np.int64))))
-    return tuple(f for part in rows if len(part) > 1 for f in check_ego_motion(ego_motion.of_rows(part)))
+    return tuple(f for scene in rows if len(scene) > 1 for f in check_ego_motion(ego_motion.of_rows(scene)))
 
 
 def _units(drive: _Drive) -> Finding | None:

@@ -101,7 +101,7 @@ def run_fingerprint(model: Model, drive: Drive, options: object) -> dict[str, st
     }
 
 
-def saved_state(folder: RunFolder, fingerprint: Mapping[str, str], kind: type[State]) -> State | None:
+def saved_state(folder: RunFolder, fingerprint: Mapping[str, str], cls: type[State]) -> State | None:
     """The state of a kind in a folder, None if there is none.
 
     Raises OutputError if it is damaged, of another kind, or of a run with another fingerprint.
@@ -109,7 +109,7 @@ def saved_state(folder: RunFolder, fingerprint: Mapping[str, str], kind: type[St
     if not folder.state_path.exists():
         return None
     try:
-        state = load_state(folder.state_path, kind)
+        state = load_state(folder.state_path, cls)
     except InputError as error:
         raise OutputError(f"`resume` (`--resume`): {error}; {START_ANEW}") from None
     before, now = state.fingerprint, fingerprint
@@ -131,7 +131,7 @@ def save_state(path: Path, state: object) -> None:
     write_whole(path, FORMAT + hashlib.sha256(content).digest() + content, regular=True)
 
 
-def load_state(path: Path, kind: type[Loaded]) -> Loaded:
+def load_state(path: Path, cls: type[Loaded]) -> Loaded:
     """Read a state that `save_state` wrote; tensors are on the CPU.
 
     kind: the type of the state. Its dataclasses state the type of every field.
@@ -144,25 +144,25 @@ def load_state(path: Path, kind: type[Loaded]) -> Loaded:
     if hashlib.sha256(content).digest() != written[len(FORMAT) : -len(content)]:
         raise InputError(f"{path}: the state cannot be read: the file is damaged")
     try:
-        state = load_data(BytesIO(content), [*NUMPY, *_classes_in(kind, set())])
+        state = load_data(BytesIO(content), [*NUMPY, *_classes_in(cls, set())])
     except (pickle.UnpicklingError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
         reason = " ".join(str(error).rpartition("WeightsUnpickler error: ")[2].split())
         raise InputError(f"{path}: the state cannot be read ({reason:.200})") from None
-    if not isinstance(state, get_origin(kind) or kind):
-        raise InputError(f"{path}: the state cannot be read (expected {kind}, found a {type(state).__name__})")
+    if not isinstance(state, get_origin(cls) or cls):
+        raise InputError(f"{path}: the state cannot be read (expected {cls}, found a {type(state).__name__})")
     return state
 
 
-def _classes_in(hint: Any, known: set[Any]) -> Iterator[Any]:
+def _classes_in(hint: Any, classes: set[Any]) -> Iterator[Any]:
     """The dataclasses in a type, and in the types of their fields."""
     for argument in get_args(hint):
-        yield from _classes_in(argument, known)
-    kind = get_origin(hint) or hint
-    if is_dataclass(kind) and kind not in known:
-        known.add(kind)
-        yield kind
-        for of_field in get_type_hints(kind).values():
-            yield from _classes_in(of_field, known)
+        yield from _classes_in(argument, classes)
+    cls = get_origin(hint) or hint
+    if is_dataclass(cls) and cls not in classes:
+        classes.add(cls)
+        yield cls
+        for of_field in get_type_hints(cls).values():
+            yield from _classes_in(of_field, classes)
 
 
 def digest(tree: object) -> str:
@@ -173,10 +173,10 @@ def digest(tree: object) -> str:
 def _described(path: Path) -> tuple[str, int, str]:
     """Name, size, and hash or time of a file of the input."""
     try:
-        found = path.stat()
-        if found.st_size > HASHED_BYTES:
-            return path.name, found.st_size, str(found.st_mtime_ns)
-        return path.name, found.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
+        status = path.stat()
+        if status.st_size > HASHED_BYTES:
+            return path.name, status.st_size, str(status.st_mtime_ns)
+        return path.name, status.st_size, hashlib.sha256(read_bytes(path, HASHED_BYTES)).hexdigest()
     except OSError as error:
         return path.name, -1, str(error.strerror)
     except InputError as error:
@@ -189,8 +189,8 @@ def _described_images(drive: Drive) -> str:
     hashed = hashlib.sha256()
     for path in paths:
         try:
-            found = path.stat()
-            hashed.update(f"{path.name} {found.st_size} {found.st_mtime_ns}\n".encode(errors="surrogateescape"))
+            status = path.stat()
+            hashed.update(f"{path.name} {status.st_size} {status.st_mtime_ns}\n".encode(errors="surrogateescape"))
         except OSError as error:
             hashed.update(f"{path.name} {error.errno}\n".encode(errors="surrogateescape"))
         except ValueError:  # a null byte in the name

@@ -165,7 +165,7 @@ class RunSummary:
             "camera_embeddings": counts.embeddings,
             "dropped_images": [{"frame": f, "camera": c, "reason": why} for f, c, why in counts.dropped],
             "skipped_frames": counts.skipped,
-            "not_finite_frames": [{"frame": f, "where": where} for f, where in counts.not_finite],
+            "not_finite_frames": [{"frame": f, "where": layer} for f, layer in counts.not_finite],
             "started_anew": [{"frame": f, "reason": why} for f, why in counts.started_anew],
             "notes": [*self._drive.notes, *self._input_notes()],
             "files": [str(path) for path in self.files],
@@ -180,7 +180,7 @@ class RunSummary:
     def table(self) -> str:
         """The summary as a few aligned lines."""
         counts = self.counts
-        guessed = [f"{name} as {given}" for name, given in counts.embeddings.items() if name != given]
+        guessed = [f"{name} as {stand_in}" for name, stand_in in counts.embeddings.items() if name != stand_in]
         stages = ", ".join(f"{stage} {1000 * s.value():.0f} ms" for stage, s in counts.seconds.items())
         rows = [
             ("frames", f"{self.frames} in {duration(counts.whole.total_s)}, {self._rate():.2f} per second"),
@@ -195,8 +195,8 @@ class RunSummary:
             images, frames = counted(len(counts.dropped), "images"), counted(len(counts.skipped), "frames")
             rows.append(("dropped", f"{images}, {frames} without any"))
         if counts.not_finite:
-            _, where = counts.not_finite[0]
-            rows.append(("failed", f"{counted(len(counts.not_finite), 'frames')}: NaN or infinity, first in {where}"))
+            _, layer = counts.not_finite[0]
+            rows.append(("failed", f"{counted(len(counts.not_finite), 'frames')}: NaN or infinity, first in {layer}"))
         if self._model.untrained:
             rows.append(("weights", "UNTRAINED: random weights, the boxes are meaningless"))
         rows += [("rig", note) for note in self._input_notes()]

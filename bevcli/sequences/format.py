@@ -94,9 +94,9 @@ def format_of(path: Path) -> type[Format]:
                 f"{path}: is a folder of {len(drives)} drives ({few}): choose one with `scene` (`--scene`), or run all "
                 "by `bevcli batch`"
             )
-        kind = "is a file, and not" if path.is_file() else "is not"
+        problem = "is a file, and not" if path.is_file() else "is not"
         expected = _either([f"{form.name} (expected {form.expected})" for form in candidates])
-        raise InputError("; ".join([f"{path}: {kind} {expected}", *map(str, broken)]))
+        raise InputError("; ".join([f"{path}: {problem} {expected}", *map(str, broken)]))
     highest = max(form.precedence for form in matching)
     first, *others = [form for form in matching if form.precedence == highest]
     if others:
@@ -119,34 +119,34 @@ def drives_in(root: Path) -> dict[str, Path]:
     return {name if names[path.name] > 1 else path.name: path for name, path in drives.items()}
 
 
-def _drives_below(folder: Path, known: Iterable[type[Format]], depth: int) -> Iterator[Path]:
+def _drives_below(folder: Path, formats: Iterable[type[Format]], depth: int) -> Iterator[Path]:
     if not folder.is_dir():
         return
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):
             continue
         with suppress(OSError):  # a folder that this user may not read holds no drive of theirs
-            if any(form.recognises(path) for form in known):
+            if any(form.recognises(path) for form in formats):
                 yield path
             elif depth > 1:
-                yield from _drives_below(path, known, depth - 1)
+                yield from _drives_below(path, formats, depth - 1)
 
 
-def check_options(values: Mapping[str, Any], chosen: Iterable[type[Format]], where: str) -> None:
+def check_options(values: Mapping[str, Any], classes: Iterable[type[Format]], location: str) -> None:
     """Check that formats have the options that are given. Values that are the default are accepted for every format.
 
     where: start of a message. Raises InputError for an option that only other formats have; TypeError for one that no
     format has, or BevcliError if a format cannot be imported that may have it.
     """
-    own = {name for form in chosen for name in defaults(form)}
-    for name in (name for name in values if name not in own):
+    option_names = {name for form in classes for name in defaults(form)}
+    for name in (name for name in values if name not in option_names):
         broken: list[BevcliError] = []
         having = [form for form in formats(broken) if name in defaults(form)]
         if not having:
             raise broken[0] if broken else TypeError(f"open_sequence() has no option `{name}`")
         if values[name] != defaults(having[0])[name]:
             option = named(having[0], name)
-            raise InputError(f"{where}: {option} is for {_either([form.name for form in having])}: remove it")
+            raise InputError(f"{location}: {option} is for {_either([form.name for form in having])}: remove it")
 
 
 def _either(names: list[str]) -> str:

@@ -152,10 +152,10 @@ class ImageReader:
         """Raises InputError for a wrong size of a camera's first image, UnreadableImage for that of a later one."""
         if size == (camera.width, camera.height):
             return
-        found = f"the image is {size[0]}x{size[1]} (expected {camera.width}x{camera.height}, as in the calibration)"
+        problem = f"the image is {size[0]}x{size[1]} (expected {camera.width}x{camera.height}, as in the calibration)"
         if camera.name in self._fitting:
-            raise UnreadableImage(f"{source}: {found}")
-        raise InputError(f"{source}: camera {camera.name}: {found}: use the calibration of this image size")
+            raise UnreadableImage(f"{source}: {problem}")
+        raise InputError(f"{source}: camera {camera.name}: {problem}: use the calibration of this image size")
 
     def _read_file(self, source: ImageSource, camera: Camera) -> CameraImage:
         """An image file. Its size is checked by its header, before it is decoded."""

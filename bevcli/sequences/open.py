@@ -64,10 +64,10 @@ def open_steps(
         path, options = named, replace(options, scene=None)
     if options.odometry:
         options = replace(options, ego_motion="measured")
-    chosen = format_of(path)
-    check_options(changes, [chosen], f"{path}: is {chosen.name}")
-    own = gather(chosen, None, {name: value for name, value in changes.items() if name in defaults(chosen)})
-    drive = own.open(path, options)
+    opened = format_of(path)
+    check_options(changes, [opened], f"{path}: is {opened.name}")
+    made = gather(opened, None, {name: value for name, value in changes.items() if name in defaults(opened)})
+    drive = made.open(path, options)
     check_time_unit(drive, path)
     if options.ground_truth:
         names = ClassNames(options.class_map, options.classes or NUSCENES_CLASSES)
@@ -81,7 +81,7 @@ def open_steps(
     if options.every is not None:
         drive = select_every(drive, options.every)
     rate_hz = options.rate_hz
-    if rate_hz is None and options.every is None and not own.wants_all_frames:
+    if rate_hz is None and options.every is None and not made.wants_all_frames:
         rate_hz = options.model_rate_hz
     if rate_hz is not None and rate_hz != "all":
         drive = select_rate(drive, rate_hz)

@@ -163,8 +163,8 @@ def select_rate(drive: Drive, rate_hz: float) -> Drive:
         times = np.array([stamps[index].timestamp_ns for index in indices], dtype=np.int64)
         ratio = float(1e9 / np.median(np.diff(times))) / rate_hz if len(times) > 1 else np.inf
         slowest = min(slowest, ratio)
-        chosen = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
-        kept += [indices[position] for position in chosen]
+        positions = _nearest_to_clock(times, rate_hz) if ratio > FASTEST_RATIO else range(len(indices))
+        kept += [indices[position] for position in positions]
     notes = []
     if len(kept) < len(stamps):
         notes.append(

@@ -157,12 +157,12 @@ class _Failed(Exception):
     """Another attempt may help."""
 
 
-def _require_space(folder: Path, wanted: int) -> None:
+def _require_space(folder: Path, needed: int) -> None:
     """Raise OutputError where a disk has too little space. wanted: bytes."""
     free = shutil.disk_usage(folder).free - SPARE_BYTES
-    if wanted > free:
+    if needed > free:
         raise OutputError(
-            f"{folder}: the disk has too little space: {wanted / 1e6:.0f} MB are needed, {max(free, 0) / 1e6:.0f} MB "
+            f"{folder}: the disk has too little space: {needed / 1e6:.0f} MB are needed, {max(free, 0) / 1e6:.0f} MB "
             "are free: free some, or pass `weights_dir` (`--weights-dir DIR`) on another disk"
         )
 
@@ -280,8 +280,8 @@ class Download:
         """
         length, tag = answer.headers.get("Content-Length", ""), answer.headers.get("ETag", "")
         if answer.status == 206:
-            stated = CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
-            first, last, self.total = map(int, stated.groups()) if stated else (-1, -1, -1)
+            match = CONTENT_RANGE.fullmatch(answer.headers.get("Content-Range", ""))
+            first, last, self.total = map(int, match.groups()) if match else (-1, -1, -1)
             goes_on = part is not None and (first, self.total, tag or part.tag) == (self.done, part.total, part.tag)
             if not goes_on or not first <= last < self.total:
                 self._start_anew()

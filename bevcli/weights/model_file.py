@@ -32,20 +32,20 @@ def model_file_for(
         OutputError: the file exists, has another ending, or cannot be written.
         ConfigError: a name is no name of a class, or stands there twice.
     """
-    chosen = gather(ModelFileOptions, options, changes)
+    file_options = gather(ModelFileOptions, options, changes)
     path, checkpoint = Path(out), read_checkpoint(Path(weights))
     if path.suffix != ".toml":
         raise OutputError(f"{path}: expected a file name that ends in .toml")
-    if path.exists() and not chosen.force:
+    if path.exists() and not file_options.force:
         raise OutputError(
             f"{path}: already exists; choose another name, or pass `force=True` (`--force`) to overwrite it"
         )
     model = checkpoint.nearest
-    names = chosen.classes or _stated(checkpoint)
-    known = load_config(model)
-    count = len(known.classes) if checkpoint.models else checkpoint.own_classes
+    names = file_options.classes or _stated(checkpoint)
+    model_config = load_config(model)
+    count = len(model_config.classes) if checkpoint.models else checkpoint.own_classes
     if count is None:
-        other = difference(checkpoint.state, expected_state(known), len(known.classes))
+        other = difference(checkpoint.state, expected_state(model_config), len(model_config.classes))
         raise WeightsError(f"{weights}: differs from {model}, the nearest known model, in more than classes: {other}")
     if len(names) != count:
         found = counted(len(names), "names") if names else "none"
@@ -65,7 +65,7 @@ def model_file_for(
 def _stated(checkpoint: Checkpoint) -> tuple[str, ...]:
     """The classes that the metadata of weights name; else none."""
     try:
-        stated = json.loads(checkpoint.facts.get("classes", "[]"))
+        classes = json.loads(checkpoint.facts.get("classes", "[]"))
     except ValueError:
         return ()
-    return tuple(map(str, stated)) if isinstance(stated, list) else ()
+    return tuple(map(str, classes)) if isinstance(classes, list) else ()

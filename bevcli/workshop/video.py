@@ -196,8 +196,8 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
         return np.clip(points * scale, -FAR, FAR)
 
     boxes = entities.overlay(tile.camera, "boxes")
-    for kind in entities.line_kinds(frame.rows):
-        draw_faded_strips(canvas, frame, entities.overlay(tile.camera, kind), to_canvas)
+    for line_kind in entities.line_kinds(frame.rows):
+        draw_faded_strips(canvas, frame, entities.overlay(tile.camera, line_kind), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, entities.IMAGE_BOXES), to_canvas)
     draw_strips(canvas, frame, entities.overlay(tile.camera, "ground_truth"), to_canvas)
     layers = [entities.layer(entities.camera(tile.camera), name) for name in _layers(frame)]
@@ -217,8 +217,8 @@ def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
         _draw_placed(canvas, frame, entities.BEV_SEGMENTATION, segmentation, to_canvas)
     draw_strips(canvas, frame, entities.BEV_RINGS, to_canvas)
     draw_labels(canvas, frame, f"{entities.BEV_RINGS}/labels", to_canvas, 0.35)
-    for kind in entities.line_kinds(frame.rows):
-        draw_faded_strips(canvas, frame, f"{entities.BEV}/{kind}", to_canvas)
+    for line_kind in entities.line_kinds(frame.rows):
+        draw_faded_strips(canvas, frame, f"{entities.BEV}/{line_kind}", to_canvas)
     for entity in BELOW_BOXES:
         draw_strips(canvas, frame, entity, to_canvas)
     for entity in (entities.BEV_BOXES, *(entities.layer(entities.BEV, name) for name in _layers(frame))):

@@ -66,9 +66,9 @@ def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
 
 def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch):
     monkeypatch.setattr(calibrate, "motion_findings", lambda drive: (OFF,))
-    (finding,) = check(lambda: MadeDrive(MISTAKES["km/h"][0]))
+    (finding,) = check(MadeDrive(MISTAKES["km/h"][0]))
     assert finding.code == "motion-scale"
-    assert check(lambda: MadeDrive(stated())) == (OFF,)
+    assert check(MadeDrive(stated())) == (OFF,)
 
 
 def test_one_cause_is_told_where_both_are_off():

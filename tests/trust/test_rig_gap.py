@@ -103,7 +103,7 @@ def test_a_slow_and_dark_drive_is_told():
     drive = SimpleNamespace(
         stamps=[FrameStamp(k, "", k * 10**9) for k in range(5)], load=lambda place: SimpleNamespace(images={"A": image})
     )
-    rate, light = gap_option.of_drive(lambda **how: drive, DEMO)
+    rate, light = gap_option.of_drive(drive, DEMO)
     assert (rate.text, rate.amount) == ("1 images a second of each camera (theirs 2)", 2)
     assert light.text.startswith("dark images: mean grey 20")
     thin, even = rig_gap.trial(nuscenes_like_rig(), [rate], KNOWN, RANGE_M)

@@ -55,7 +55,7 @@ def choose_kernels(model: nn.Module, device: torch.device) -> None:
     for module in attentions:
         module.sampling = sampling(keeps_sizes=True)
     # Those with many queries; on a GPU all, where each kernel of its own takes time to launch.
-    encoder = [part.attention for part in model.modules() if isinstance(part, BY_HITS)]
+    encoder = [module.attention for module in model.modules() if isinstance(module, BY_HITS)]
     for module in encoder if device.type == "cpu" else attentions:
         module.sampling.sample_hits = kernel
 

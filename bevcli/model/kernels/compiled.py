@@ -183,16 +183,16 @@ def in_threads(work: Callable[[int, int], None], rows: int, min_range: int = 64)
     if threads == 1 or len(starts) <= 1:
         work(0, rows)
         return
-    left = iter(starts)  # gives each start to one thread
+    remaining = iter(starts)  # gives each start to one thread
 
     def take_ranges() -> None:
-        for start in left:
+        for start in remaining:
             work(start, min(start + step, rows))
 
     pool = _pool(os.getpid(), threads - 1)
     helpers = [pool.submit(take_ranges) for _ in range(min(threads, len(starts)) - 1)]
     try:
-        for start in left:  # as the helpers
+        for start in remaining:  # as the helpers
             work(start, min(start + step, rows))
     finally:
         wait(helpers)

@@ -105,8 +105,8 @@ class TokensInOnePass(ImageTokens):
             of_cameras = self.camera_embedding[camera_index].reshape(-1, channels)  # (N, C) or (B·N, C)
             embedding = embedding + of_cameras.repeat(images // len(of_cameras), 1)  # (L, B·N, C)
         parts = tokens.split([x.shape[1] for x in levels], dim=1)
-        for level, part, added in zip(levels, parts, embedding, strict=True):
-            torch.add(level, added[:, None], out=part)
+        for level, output, added in zip(levels, parts, embedding, strict=True):
+            torch.add(level, added[:, None], out=output)
         return FeatureMaps(tokens, tuple((x.shape[-2], x.shape[-1]) for x in maps))
 
 
@@ -264,17 +264,17 @@ class CudaGraph:
         self._uploaded = upload.upload(upload.packed(small), device) if small else None
         of_cpu = iter([] if self._uploaded is None else upload.unpacked(self._uploaded, small))
         self._inputs = [next(of_cpu) if x.device.type == "cpu" else x.clone() for x in self._sources]
-        own = upload.exchanged(arguments, iter(self._inputs))
+        inputs = upload.exchanged(arguments, iter(self._inputs))
         with torch.cuda.device(device):
             stream = torch.cuda.Stream(device)
             stream.wait_stream(torch.cuda.current_stream(device))
             with torch.cuda.stream(stream):
-                function(*own)  # libraries make their workspaces for this stream
+                function(*inputs)  # libraries make their workspaces for this stream
             torch.cuda.current_stream(device).wait_stream(stream)
             self._graph = torch.cuda.CUDAGraph()
             # Other threads allocate and copy meanwhile: the one that uploads images, and those of other runs.
             with torch.cuda.graph(self._graph, pool=pool, stream=stream, capture_error_mode="thread_local"):
-                self._outputs = function(*own)
+                self._outputs = function(*inputs)
 
     def replay(self, arguments: tuple[Any, ...]) -> Any:
         """The results for other arguments of the same shapes, in new memory."""
@@ -308,7 +308,7 @@ class Captured:
         self._function, self._device, self._rounds = function, device, rounds
         parts = [module for module in model.modules() if module is not model]
         # PyTorch does not tell by a public name whether a module has hooks.
-        hooks = [hooks for part in parts for hooks in (part._forward_hooks, part._forward_pre_hooks)]
+        hooks = [hooks for module in parts for hooks in (module._forward_hooks, module._forward_pre_hooks)]
         self._no_hooks, self._own = [kind for kind in hooks if not kind], [kind for kind in hooks if kind]
         self._own_hooks = sum(map(len, self._own))
         self.graphs: OrderedDict[Any, CudaGraph | None] = OrderedDict()

@@ -48,8 +48,8 @@ def _sum_channels(typing, width, values, first, step, cells, shares, begin, end,
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = [
-            context.make_array(kind)(context, builder, argument) if isinstance(kind, types.Array) else argument
-            for kind, argument in zip(signature.args, arguments, strict=True)
+            context.make_array(type_)(context, builder, argument) if isinstance(type_, types.Array) else argument
+            for type_, argument in zip(signature.args, arguments, strict=True)
         ]
         _, value_array, start, cell_step, cell_array, share_array, first_sample, last_sample, out_array, target = data
         lanes, halves = signature.args[0].literal_value, signature.args[1].dtype == types.uint16

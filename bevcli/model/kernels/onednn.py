@@ -157,16 +157,16 @@ class FusedBlock(nn.Module):
         return self.last(y, shortcut if self.overwrites or shortcut is not x else x.clone())
 
 
-def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
+def use_onednn(module: nn.Module, *, rounds: bool = False) -> None:
     """Replaces convolutions, linear layers and residual blocks of a module, in place, for inference.
 
     Batch norms must be folded already; a block with a batch norm of its own stays as it is. A block may write over its
     input within a `Stage`. rounds: linear layers of float32 compute in `rounded_products`, except for those that
     predict positions: boxes would move.
     """
-    left = [(part, rounds)]
-    while left:
-        parent, rounds_parent = left.pop()
+    pending = [(module, rounds)]
+    while pending:
+        parent, rounds_parent = pending.pop()
         for index, (name, child) in enumerate(parent.named_children()):
             rounds_child = rounds_parent and name != "reference_points" and not isinstance(child, RegressionBranch)
             fast = child
@@ -188,7 +188,7 @@ def use_onednn(part: nn.Module, *, rounds: bool = False) -> None:
             elif type(child) is nn.Linear:
                 fast = PackedLinear(child, rounds=rounds_child)
             setattr(parent, name, fast)
-            left.append((fast, rounds_child))
+            pending.append((fast, rounds_child))
 
 
 BLOCKS: dict[type[nn.Module], Callable[..., nn.Module]] = {

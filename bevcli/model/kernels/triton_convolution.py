@@ -109,9 +109,9 @@ def _launch(kernel: Any, tensors: Sequence[Tensor], stride: int, tiles: Mapping[
     x, predicted = tensors[:2]
     positions = predicted[:, 0].numel()
     if positions:
-        chosen = constants(x.shape[1], stride, tiles)
-        grid = (triton.cdiv(positions, chosen["BLOCK"]) * 9 // chosen["TAPS"],)
-        kernel[grid](*tensors, positions, *x.shape[2:], *predicted.shape[2:], **chosen)
+        settings = constants(x.shape[1], stride, tiles)
+        grid = (triton.cdiv(positions, settings["BLOCK"]) * 9 // settings["TAPS"],)
+        kernel[grid](*tensors, positions, *x.shape[2:], *predicted.shape[2:], **settings)
 
 
 def constants(channels: int, stride: int, tiles: Mapping[str, int]) -> dict[str, int]:

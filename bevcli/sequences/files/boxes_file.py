@@ -60,14 +60,14 @@ class ClassNames:
         self.known = tuple(classes)
         self._by_name: dict[str, str] = {name: name for name in self.known}
         self._by_lower_case = {name.lower(): name for name in reversed(self.known)}
-        known = dict(self._by_lower_case)
+        targets = dict(self._by_lower_case)
         for name, target in (renames or {}).items():
-            if target.lower() not in known:
+            if target.lower() not in targets:
                 raise InputError(
                     f'`class_map` (`--class-map`) {name}={target}: "{target}" is not a class (expected one of '
                     f"{', '.join(self.known)})"
                 )
-            exact = target if target in self.known else known[target.lower()]
+            exact = target if target in self.known else targets[target.lower()]
             self._by_lower_case[name.lower()] = self._by_name[name] = exact
 
     @staticmethod
@@ -99,7 +99,7 @@ class ClassNames:
             renamed[self[name]] += count
         return renamed
 
-    def note(self, counts: Mapping[str, int], where: str, use: str = "scored") -> tuple[str, ...]:
+    def note(self, counts: Mapping[str, int], location: str, use: str = "scored") -> tuple[str, ...]:
         """A note about boxes whose class is not known, if there are any.
 
         counts: number of boxes by the file's names. where: the file or the side that has them. use: what is not done
@@ -110,18 +110,18 @@ class ClassNames:
             return ()
         named = ", ".join(f"{name} ({count})" for name, count in sorted(others.items()))
         return (
-            f"{where}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
+            f"{location}: {sum(others.values())} boxes have other classes and are not {use}: {named} "
             f'(`class_map` (`--class-map`) "{min(others)}={self.known[0]}" renames a class)',
         )
 
 
 def read_class_map(path: Path) -> dict[str, str]:
     """A class map in TOML, one `"Name in the file" = "class"` a line. Raises InputError if it is not one."""
-    stated = parse_toml(read_text(path, TOML_BYTES), path)
-    for name, target in stated.items():
+    class_map = parse_toml(read_text(path, TOML_BYTES), path)
+    for name, target in class_map.items():
         if not isinstance(target, str):
             raise InputError(f'{path}: {name}: expected the name of a class, such as "truck", found {target!r:.40}')
-    return stated
+    return class_map
 
 
 def count_classes(frames: Iterable[Boxes3D]) -> Counter[str]:
@@ -153,7 +153,7 @@ _Box: Any = msgspec.defstruct(
 )
 
 
-def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
+def boxes_from_json(objects: Any, location: str, class_names: ClassNames = _OWN_NAMES) -> Boxes3D:
     """N boxes from a list of N JSON objects. A missing or null velocity becomes NaN.
 
     where: start of an error message, such as "boxes.json: frame 3". class_names: maps the classes; names that it does
@@ -161,19 +161,19 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     Raises InputError that names the first invalid box by its index in the list.
     """
     if not isinstance(objects, list):
-        raise InputError(f'{where}: "boxes" must be a list, found {objects!r:.40}')
+        raise InputError(f'{location}: "boxes" must be a list, found {objects!r:.40}')
     if not objects:
         return Boxes3D.empty()
     try:
         rows = msgspec.convert(objects, list[_Box])
     except msgspec.ValidationError:
         index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
-        raise InputError(f"{where}: box {index}: {mistake}") from None
+        raise InputError(f"{location}: box {index}: {mistake}") from None
     columns: dict[str, NDArray[Any] | None] = {}
     for name, column in OPTIONAL_COLUMNS.items():
-        given = [getattr(row, column.key) for row in rows]
-        known = [column.unknown if value is UNSET or value is None else value for value in given]
-        columns[name] = None if given.count(UNSET) == len(given) else np.array(known)
+        raw = [getattr(row, column.key) for row in rows]
+        filled = [column.unknown if value is UNSET or value is None else value for value in raw]
+        columns[name] = None if raw.count(UNSET) == len(raw) else np.array(filled)
     boxes = Boxes3D(
         centers=np.array([row.center for row in rows]),
         sizes_lwh=np.array([row.size_lwh for row in rows]),
@@ -181,11 +181,11 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
         velocities=np.array([row.velocity or (None, None) for row in rows], dtype=np.float64),
         classes=np.array([class_names[row.name] for row in rows]),
         **columns,
-        **(_futures(rows, where) if any(row.futures for row in rows) else {}),
+        **(_futures(rows, location) if any(row.futures for row in rows) else {}),
     )
     without = [index for index, row in enumerate(rows) if row.score is UNSET]
     if 0 < len(without) < len(rows):
-        raise InputError(f'{where}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
+        raise InputError(f'{location}: box {without[0]}: "score" is missing (other boxes of the frame have one)')
     sizes = boxes.sizes_lwh
     checks: list[tuple[str, NDArray[Any], NDArray[np.bool_], str]] = [
         (column.key, shares, ((shares >= 0) & (shares <= 1)) | np.isnan(shares), "0 to 1")
@@ -197,7 +197,7 @@ def boxes_from_json(objects: Any, where: str, class_names: ClassNames = _OWN_NAM
     for key, values, good, expected in (*checks, ("size_lwh", sizes, sizes > 0, "numbers above 0")):
         if not good.all():
             index = int(np.argmin(good.reshape(len(good), -1).all(axis=1)))
-            raise InputError(f"{where}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
+            raise InputError(f"{location}: box {index}: {key}: expected {expected}, found {values[index].tolist()}")
     return boxes
 
 
@@ -250,9 +250,9 @@ def _mistake(box: Any) -> str:
     return ""
 
 
-def _description(kind: Any) -> str:
+def _description(hint: Any) -> str:
     """The description in a type, or in one of the types of a union."""
-    notes = [note for part in (kind, *get_args(kind)) for note in getattr(part, "__metadata__", ())]
+    notes = [note for argument in (hint, *get_args(hint)) for note in getattr(argument, "__metadata__", ())]
     return str(notes[0].description)
 
 
@@ -269,7 +269,7 @@ def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D, futures: Arr
             box["future_scores"] = boxes.future_scores[index].tolist()
 
 
-def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
+def _futures(rows: Sequence[Any], location: str) -> dict[str, Any]:
     """The columns `futures` and `future_scores` of Boxes3D, of rows of which one or more have futures."""
     having = {index: row for index, row in enumerate(rows) if row.futures}
     first = next(iter(having.values()))
@@ -279,7 +279,7 @@ def _futures(rows: Sequence[Any], where: str) -> dict[str, Any]:
         counts = [len(mode) for mode in row.futures or ()]
         if counts != [steps] * modes or len(row.future_times_s) != steps or len(row.future_scores or counts) != modes:
             raise InputError(
-                f"{where}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
+                f"{location}: box {index}: futures: {len(counts)} modes of {counts[0]} steps (expected {modes} of "
                 f"{steps}, as in the other boxes of the frame, with a score for each mode and a time for each step)"
             )
         futures[index, ..., 0] = row.future_times_s
@@ -348,8 +348,8 @@ def read_boxes(
     with without_garbage_collection():
         content = read_frames(path, FORMAT, "a boxes file", FRAMES_OF_REFERENCE)
         reference, rows = content["frame_of_reference"], content["frames"]
-        stated = _stated_classes(content, path) if "classes" in content else None
-        names = ClassNames(class_map, classes or stated or NUSCENES_CLASSES)
+        own_classes = _stated_classes(content, path) if "classes" in content else None
+        names = ClassNames(class_map, classes or own_classes or NUSCENES_CLASSES)
         frames = tuple(_frame(path, index, row, reference, names) for index, row in enumerate(rows))
     moments: set[tuple[str, int]] = set()
     for stamp in (frame.stamp for frame in frames):
@@ -365,7 +365,7 @@ def read_boxes(
         frames,
         None if ego_from_bev is None else pose_from_json(ego_from_bev, "ego_from_bev", str(path)),
         {key: value for key, value in content.items() if key not in _FILE_KEYS},
-        stated,
+        own_classes,
     )
 
 
@@ -428,15 +428,15 @@ def write_boxes(boxes: BoxesFile, path: Path) -> int:
 
 def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:
     stamp = stamp_from_json(row, f"{path}: entry {index} of frames")
-    where = f"{path}: frame {stamp.index}"
+    location = f"{path}: frame {stamp.index}"
     if "boxes" not in row:
-        raise InputError(f'{where}: "boxes" is missing (expected a list, empty for a frame without boxes)')
-    stated = row.get("world_from_ego")
-    if stated is None and frame_of_reference == "world":
-        raise InputError(f'{where}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
+        raise InputError(f'{location}: "boxes" is missing (expected a list, empty for a frame without boxes)')
+    pose = row.get("world_from_ego")
+    if pose is None and frame_of_reference == "world":
+        raise InputError(f'{location}: "world_from_ego" is missing (required if "frame_of_reference" is "world")')
     return FrameBoxes(
         stamp,
-        None if stated is None else pose_from_json(stated, "world_from_ego", where),
-        boxes_from_json(row["boxes"], where, class_names),
+        None if pose is None else pose_from_json(pose, "world_from_ego", location),
+        boxes_from_json(row["boxes"], location, class_names),
         {key: value for key, value in row.items() if key not in _FRAME_KEYS},
     )

@@ -149,14 +149,14 @@ def draft_calibration(path: Path) -> RigDraft:
     else:
         drafts = [parse_camera(name, entry, replace(report, camera=name)) for name, entry in entries.items()]
     cameras = tuple(camera for camera in drafts if camera is not None)
-    given = "ego_from_bev" in document
-    stated = parse_transform(document, "ego_from_bev", report) if given else None
-    ego_from_bev = default_ego_from_bev() if stated is None else stated
+    is_given = "ego_from_bev" in document
+    transform = parse_transform(document, "ego_from_bev", report) if is_given else None
+    ego_from_bev = default_ego_from_bev() if transform is None else transform
     rendered = document.get("rendered", False)
     if not isinstance(rendered, bool):
         report.error("wrong-shape", "rendered", "is not true or false", expected="true or false", found=rendered)
     geo_origin = None if document.get("geo_origin") is None else _parse_geo_origin(document["geo_origin"], report)
-    rig = CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not given)
+    rig = CameraRig(cameras, ego_from_bev, ego_from_bev_assumed=not is_given)
     return RigDraft(rig, tuple(report.findings), DriveFacts(rendered is True, geo_origin))
 
 
@@ -181,13 +181,13 @@ def _parse_geo_origin(value: object, report: Report) -> GeoOrigin | None:
         expected = '{"latitude": 48.137, "longitude": 11.575, "heading_deg": 90}'
         report.error("wrong-shape", "geo_origin", "is not an object", expected=expected, found=value)
         return None
-    inside, stated = replace(report, prefix="geo_origin."), {"heading_deg": EAST_DEG, **value}
+    inside, fields = replace(report, prefix="geo_origin."), {"heading_deg": EAST_DEG, **value}
     degrees: list[float] = []
     for name, limit in ORIGIN_LIMITS.items():
-        number = parse_numbers({name: [stated[name]]} if name in stated else {}, name, (1,), inside)
+        number = parse_numbers({name: [fields[name]]} if name in fields else {}, name, (1,), inside)
         if number is not None and abs(number[0]) > limit:
             expected = f"degrees, -{limit:g} to {limit:g}"
-            inside.error("wrong-size", name, "is out of range", expected=expected, found=quoted(stated[name]))
+            inside.error("wrong-size", name, "is out of range", expected=expected, found=quoted(fields[name]))
         elif number is not None:
             degrees.append(float(number[0]))
     return GeoOrigin(*degrees) if len(degrees) == len(ORIGIN_LIMITS) else None
@@ -260,9 +260,9 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
     return Camera(name, width, height, intrinsics, ego_from_camera, distortion)
 
 
-def checked_camera(camera: Camera, where: Path | str) -> Camera:
+def checked_camera(camera: Camera, location: Path | str) -> Camera:
     """A camera that calibration.json may hold. where: start of an error message. Raises InputError for any other."""
-    return require(parse_camera, camera.name, _camera_to_json(camera), where=where, camera=camera.name)
+    return require(parse_camera, camera.name, _camera_to_json(camera), where=location, camera=camera.name)
 
 
 def is_file_name(name: str) -> bool:
@@ -298,8 +298,8 @@ def _parse_distortion(value: object, report: Report) -> Distortion | None:
         expected, found = " or ".join(models), value if model is None else model
         report.error("distortion-model", "distortion", "has an unknown model", expected=expected, found=found)
         return None
-    given = value.get("coefficients", [])
-    count = len(given) if isinstance(given, list) else 0
+    numbers = value.get("coefficients", [])
+    count = len(numbers) if isinstance(numbers, list) else 0
     counts = COEFFICIENT_COUNTS.get(model, (0,))
     if count not in counts:
         expected, message = f"{' or '.join(map(str, counts))} for {model}", "has the wrong number of coefficients"

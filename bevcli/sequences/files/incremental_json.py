@@ -161,9 +161,9 @@ def read_frames(path: Path, form: str, kind: str, references: tuple[str, ...]) -
     """
     missing = f'the file is missing (expected {kind}, "format": "{form}")'
     content = read_entries(path, missing=missing)
-    stated = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if stated != form:
-        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {stated!r:.40}')
+    actual_form = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if actual_form != form:
+        raise InputError(f'{path}: is not {kind}: "format" must be "{form}", found {actual_form!r:.40}')
     reference = content.get("frame_of_reference")
     if reference not in references:
         expected = f"{', '.join(references[:-1])} or {references[-1]}"
@@ -178,14 +178,14 @@ def stamp_to_json(stamp: FrameStamp) -> dict[str, Any]:
     return {"frame": stamp.index, "scene": stamp.scene, "timestamp_ns": stamp.timestamp_ns}
 
 
-def stamp_from_json(entry: Any, where: str) -> FrameStamp:
-    """The stamp of an entry of "frames", as `stamp_to_json` makes it. Raises InputError, which begins with `where`."""
+def stamp_from_json(entry: Any, location: str) -> FrameStamp:
+    """The stamp of an entry of "frames", as `stamp_to_json` makes it. Raises InputError that begins with `location`."""
     if not isinstance(entry, dict):
-        raise InputError(f"{where}: expected an object, found {entry!r:.40}")
+        raise InputError(f"{location}: expected an object, found {entry!r:.40}")
     for key in ("frame", "timestamp_ns"):
         if type(entry.get(key)) is not int:
-            raise InputError(f'{where}: "{key}" must be an integer, found {entry.get(key)!r:.40}')
+            raise InputError(f'{location}: "{key}" must be an integer, found {entry.get(key)!r:.40}')
     scene = entry.get("scene", "")
     if not isinstance(scene, str):
-        raise InputError(f"{where}: scene: expected a string, found {scene!r:.40}")
+        raise InputError(f"{location}: scene: expected a string, found {scene!r:.40}")
     return FrameStamp(entry["frame"], scene, entry["timestamp_ns"])

@@ -127,13 +127,13 @@ def transform_to_json(a_from_b: Array) -> dict[str, Any]:
     return {"translation": a_from_b[:3, 3].tolist(), "rotation": a_from_b[:3, :3].tolist()}
 
 
-def pose_from_json(value: Any, name: str, where: str) -> Pose:
+def pose_from_json(value: Any, name: str, location: str) -> Pose:
     """The pose of a transform in JSON. A quaternion keeps its sign.
 
     name: the key of the value. where: start of an error message, such as "boxes.json: frame 3".
     Raises InputError for a transform that is missing or invalid.
     """
-    matrix = require(parse_transform, {name: value}, name, where=where)
+    matrix = require(parse_transform, {name: value}, name, where=location)
     if "rotation_wxyz" not in value:
         return Pose.from_matrix(matrix)
     return Pose(matrix[:3, 3], np.array(value["rotation_wxyz"], dtype=np.float64))

@@ -93,8 +93,8 @@ def write_map(folder: Path, frame: int, bev_map: BevMap) -> None:
     path = folder / LEGEND
     if not path.exists():
         write_whole(path, f"{json.dumps(legend, indent=1)}\n".encode(), parents=True, regular=True)
-    elif (stated := read_json(path)) != legend:
-        raise InputError(f"{path}: states {stated!r:.300}, but the new map has {legend}: write it to another folder")
+    elif (existing := read_json(path)) != legend:
+        raise InputError(f"{path}: states {existing!r:.300}, but the new map has {legend}: write it to another folder")
     write_whole(map_path(folder, frame), encode_image(bev_map.cells, ".png"), regular=True)
 
 

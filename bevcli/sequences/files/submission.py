@@ -17,7 +17,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_from_
 from bevcli.sequences.files.incremental_json import IncrementalJson, existing, read_entries
 
 MAX_BOXES = 500  # per sample, by the rules of the benchmark; the best by score are kept
-TRACKED = tuple(name for name, kind in NUSCENES_CLASSES.items() if kind.tracked)
+TRACKED = tuple(name for name, object_class in NUSCENES_CLASSES.items() if object_class.tracked)
 # The keys that the submissions for a task do not share, and the columns of `Boxes3D` that they hold.
 DETECTION_COLUMNS = {"detection_name": "classes", "detection_score": "scores", "attribute_name": "attributes"}
 TRACKING_COLUMNS = {"tracking_id": "instances", "tracking_name": "classes", "tracking_score": "track_scores"}
@@ -66,7 +66,7 @@ def tracking_submission_boxes(boxes: Boxes3D, sample_token: str) -> list[dict[st
     return _objects(tracked, sample_token, TRACKING_COLUMNS, tracked.track_scores)
 
 
-def _objects(boxes: Boxes3D, sample_token: str, own: Mapping[str, str], scores: Array | None) -> list[dict[str, Any]]:
+def _objects(boxes: Boxes3D, sample_token: str, keys: Mapping[str, str], scores: Array | None) -> list[dict[str, Any]]:
     """The best boxes by descending score. own: keys of the task, and their columns."""
     assert scores is not None
     best = boxes[np.argsort(-scores, kind="stable")[:MAX_BOXES]]
@@ -76,7 +76,7 @@ def _objects(boxes: Boxes3D, sample_token: str, own: Mapping[str, str], scores: 
         "size": best.sizes_lwh[:, [1, 0, 2]],
         "rotation": np.stack([np.cos(best.yaws / 2), none, none, np.sin(best.yaws / 2)], axis=-1),
         "velocity": np.nan_to_num(best.velocities, nan=0.0),
-        **{key: getattr(best, column) for key, column in own.items()},
+        **{key: getattr(best, column) for key, column in keys.items()},
     }
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     return [{"sample_token": sample_token, **dict(zip(columns, row, strict=True))} for row in rows]
@@ -130,22 +130,22 @@ def read_submission(path: Path) -> BoxesFile:
 
 
 def _frame_from_json(index: int, token: str, rows: Any, path: Path) -> FrameBoxes:
-    where = f"{path}: sample {token}"
+    location = f"{path}: sample {token}"
     if not isinstance(rows, list):
-        raise InputError(f"{where}: expected a list of boxes, found {rows!r:.40}")
-    objects = [_box_object(row, f"{where}: box {number}") for number, row in enumerate(rows)]
+        raise InputError(f"{location}: expected a list of boxes, found {rows!r:.40}")
+    objects = [_box_object(row, f"{location}: box {number}") for number, row in enumerate(rows)]
     stamp = FrameStamp(-1 - index, "", -1 - index)  # unknown, and equal to no stamp of another file
-    return FrameBoxes(stamp, None, boxes_from_json(objects, where), {"sample_token": token})
+    return FrameBoxes(stamp, None, boxes_from_json(objects, location), {"sample_token": token})
 
 
-def _box_object(row: Any, where: str) -> dict[str, Any]:
+def _box_object(row: Any, location: str) -> dict[str, Any]:
     """A box of a submission with the keys of a boxes file, whose reader checks the values."""
     tracking = isinstance(row, dict) and "tracking_id" in row
-    own = TRACKING_COLUMNS if tracking else DETECTION_COLUMNS
-    needed = ("translation", "size", "rotation", "velocity", *own)
+    columns = TRACKING_COLUMNS if tracking else DETECTION_COLUMNS
+    needed = ("translation", "size", "rotation", "velocity", *columns)
     missing = [key for key in needed if not isinstance(row, dict) or key not in row]
     if missing:
-        raise InputError(f'{where}: "{missing[0]}" is missing')
+        raise InputError(f'{location}: "{missing[0]}" is missing')
     size, extras = row["size"], {"score": row.get("detection_score"), "attribute": row.get("attribute_name")}
     if tracking:
         extras = dict.fromkeys(("score", "track_score"), row["tracking_score"]) | {"instance": row["tracking_id"]}
@@ -154,13 +154,13 @@ def _box_object(row: Any, where: str) -> dict[str, Any]:
         **extras,
         "center": row["translation"],
         "size_lwh": [size[1], size[0], size[2]] if isinstance(size, list) and len(size) == 3 else size,
-        "yaw": _yaw(row["rotation"], where),
+        "yaw": _yaw(row["rotation"], location),
         "velocity": row["velocity"],
     }
 
 
-def _yaw(rotation: Any, where: str) -> float:
+def _yaw(rotation: Any, location: str) -> float:
     numbers = isinstance(rotation, list) and len(rotation) == 4 and all(type(v) in (int, float) for v in rotation)
     if not numbers or not abs(np.linalg.norm(rotation) - 1) < 1e-2:
-        raise InputError(f"{where}: rotation: expected 4 numbers of norm 1 (w, x, y, z), found {rotation!r:.60}")
+        raise InputError(f"{location}: rotation: expected 4 numbers of norm 1 (w, x, y, z), found {rotation!r:.60}")
     return yaw_of_rotation(rotation_from_quaternion(rotation))

@@ -52,10 +52,10 @@ class FolderDrive(ListedDrive):
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
         if rig is None:
-            given = draft_of(own, path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
+            draft = draft_of(own, path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
         else:
-            given = RigDraft(rig, ())
-        rig, facts = given.rig, given.facts
+            draft = RigDraft(rig, ())
+        rig, facts = draft.rig, draft.facts
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         entries = read_frames_table(table, rig.names) if is_there(table) else ()
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
@@ -64,9 +64,9 @@ class FolderDrive(ListedDrive):
             from bevcli.workshop.formats.unlisted import covered, find_frames
 
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
-            found = find_frames(path, rig.names, own, motion, has_poses=has_poses)
-            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(found[0])))
-            entries, self.understood = found if poses.motion is None else covered(found, poses.motion)
+            frames = find_frames(path, rig.names, own, motion, has_poses=has_poses)
+            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0])))
+            entries, self.understood = frames if poses.motion is None else covered(frames, poses.motion)
             advice = "state the time of the first image by `start_ns` (`--start-ns`), or in timing.toml"
         assert poses is not None
         if not common.allow_outside:
@@ -79,8 +79,8 @@ class FolderDrive(ListedDrive):
         self._maps = open_maps(maps) if has_truth and maps.is_dir() else None  # which are read frame by frame
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
-        assumed = ("the calibration",) if given.notes else ()
-        notes = (*given.notes, *bev_frame_notes(rig, *assumed), *filter(None, [self.understood]), *poses.notes)
+        assumed = ("the calibration",) if draft.notes else ()
+        notes = (*draft.notes, *bev_frame_notes(rig, *assumed), *filter(None, [self.understood]), *poses.notes)
         notes += tuple(rotation_notes(videos))
         super().__init__(path, common, rig, entries, poses.motion, notes=notes)
         self.facts = replace(facts, geo_origin=facts.geo_origin or poses.geo_origin)
@@ -94,11 +94,11 @@ class FolderDrive(ListedDrive):
         # Tables and videos, but no images, which are in folders.
         return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
 
-    def _frame(self, place: int, entry: FrameEntry) -> Frame:
+    def _frame(self, position: int, entry: FrameEntry) -> Frame:
         index, time = entry.stamp.index, entry.stamp.timestamp_ns
         boxes = self._true_boxes(index, self.ego_motion.pose_at(time) if self.ego_motion else None)
         bev_map = self._maps.load(index) if self._maps and self._maps.has(index) else None
-        frame = replace(super()._frame(place, entry), ground_truth=boxes, ground_truth_map=bev_map)
+        frame = replace(super()._frame(position, entry), ground_truth=boxes, ground_truth_map=bev_map)
         lines = self._true_lines(frame) if self._true_lines and self.has_ego_motion else None
         return frame if lines is None else replace(frame, ground_truth_results=(lines,))
 

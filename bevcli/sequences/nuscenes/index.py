@@ -238,12 +238,12 @@ def tables_of(root: Path, version: str | None) -> Path:
 
 def choose_version(root: object, versions: Sequence[str], version: str | None) -> str:
     """The version with a name, or the only one. root: for messages. Raises InputError as `tables_of`."""
-    chosen = [name for name in versions if version in (None, name)]
-    if len(chosen) == 1:
-        return chosen[0]
+    matching = [name for name in versions if version in (None, name)]
+    if len(matching) == 1:
+        return matching[0]
     found = ", ".join(versions) or "none"
-    wanted = f'has no version "{version}"' if version else "has several versions"
-    raise InputError(f"{root}: {wanted} (found: {found}): choose one with `version` (`--version`)")
+    problem = f'has no version "{version}"' if version else "has several versions"
+    raise InputError(f"{root}: {problem} (found: {found}): choose one with `version` (`--version`)")
 
 
 def chosen_scenes(index: NuScenesIndex, tables: Path, split: str | None, scene: str | None = None) -> list[int]:
@@ -289,11 +289,11 @@ def split_of(scene: str, *, mini: bool) -> str:
 
 def numbers(ranges: str) -> frozenset[int]:
     """The numbers in ranges such as "3 12-18"."""
-    found: set[int] = set()
-    for part in ranges.split():
-        first, _, last = part.partition("-")
-        found |= set(range(int(first), int(last or first) + 1))
-    return frozenset(found)
+    values: set[int] = set()
+    for item in ranges.split():
+        first, _, last = item.partition("-")
+        values |= set(range(int(first), int(last or first) + 1))
+    return frozenset(values)
 
 
 def keyframes(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int, Ints]]:
@@ -304,8 +304,8 @@ def keyframes(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int, Ints
     keys = keys[np.argsort(samples, kind="stable")]
     start, end = index.scenes.first_sample[scene : scene + 2]
     bounds = np.searchsorted(np.sort(samples), np.arange(start, end + 1))
-    for place, sample in enumerate(range(start, end)):
-        yield int(index.samples.times_us[sample]), sample, keys[bounds[place] : bounds[place + 1]]
+    for position, sample in enumerate(range(start, end)):
+        yield int(index.samples.times_us[sample]), sample, keys[bounds[position] : bounds[position + 1]]
 
 
 def sweep_frames(index: NuScenesIndex, scene: int) -> Iterator[tuple[int, int | None, Ints]]:

@@ -111,8 +111,8 @@ class TableDrive(Drive):
         of_spans = [slice(*samples.first_annotation[span]) for span in spans]
         names = np.concatenate([self.index.annotations.categories[span] for span in of_spans])
         if (names == b"").any():
-            where = f"{self.tables / 'sample_annotation.json'}: {(names == b'').sum()} of {len(names)}"
-            yield f"{where} boxes are left out: instance.json lacks their instance"
+            source = f"{self.tables / 'sample_annotation.json'}: {(names == b'').sum()} of {len(names)}"
+            yield f"{source} boxes are left out: instance.json lacks their instance"
 
     @property
     def input_files(self) -> tuple[Path, ...]:
@@ -269,6 +269,6 @@ def read_can_bus(root: Path, scene: str) -> CanBus | None:
 def _camera(index: NuScenesIndex, sensor: int, image: int, tables: Path) -> Camera:
     width, height = (int(value) for value in index.images.sizes[image])
     intrinsics, lens = np.array(index.sensors.intrinsics[sensor]), brown_conrady(index.sensors.distortions[sensor])
-    where = f"{tables}: sample_data.json and calibrated_sensor.json"
+    source = f"{tables}: sample_data.json and calibrated_sensor.json"
     ego_from_camera, name = _pose_of(index.sensors, sensor).matrix, str(index.sensors.channels[sensor])
-    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, lens), where)
+    return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, lens), source)

@@ -159,13 +159,13 @@ def array_of(value: Any, shape: tuple[int, ...]) -> Array | None:
     return array if array.shape == shape and (np.abs(array) < LARGEST_NUMBER).all() else None
 
 
-def places_of(wanted: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path) -> NDArray[np.int64]:
+def places_of(tokens: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path) -> NDArray[np.int64]:
     """(N,) rows of the wanted tokens (N,) in a table with the tokens (M,). Raises InputError if one is missing."""
-    places, unknown = np.zeros(0, dtype=np.int64), wanted  # of a table without rows
+    places, unknown = np.zeros(0, dtype=np.int64), tokens  # of a table without rows
     if len(table):
         order = np.argsort(table)
-        places = order[np.searchsorted(table, wanted, sorter=order).clip(max=len(table) - 1)]
-        unknown = wanted[table[places] != wanted]
+        places = order[np.searchsorted(table, tokens, sorter=order).clip(max=len(table) - 1)]
+        unknown = tokens[table[places] != tokens]
     if len(unknown):
         token = unknown[0].decode()
         raise InputError(f'{path}: token "{token}" is missing in this table, but another table refers to it')
@@ -212,7 +212,7 @@ def _rows(columns: Columns, rows: Ints) -> Columns:
 
 
 def _joined(parts: list[Columns]) -> Columns:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return {name: np.concatenate([columns[name] for columns in parts]) for name in parts[0]}
 
 
 def _read_sensors(tables: Path) -> tuple[NDArray[np.bytes_], Sensors]:
@@ -274,12 +274,12 @@ def _read_sensor_data(
     cameras = {token.decode() for token in sensor_tokens[np.isfinite(sensors.intrinsics).all((1, 2))]}
     parts, listed = [], {token.decode() for token in sensor_tokens}
     for batch in read_batches(path):
-        facts = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
+        sensor_rows = zip(batch.rows, batch.texts("calibrated_sensor_token"), batch.column("is_key_frame"), strict=True)
         needed = batch.where(
             (owner in cameras and row.get("is_valid") is not False)
             or (key and owner in lidars)
             or owner not in listed  # an error, which `places_of` raises
-            for row, owner, key in facts
+            for row, owner, key in sensor_rows
         )
         if len(needed):
             parts.append(_sensor_data_of(needed, sample_tokens, sensor_tokens))
@@ -299,18 +299,18 @@ def _sensor_data_of(rows: Rows, sample_tokens: NDArray[np.bytes_], sensor_tokens
     }
 
 
-def _read_poses(tables: Path, wanted: NDArray[np.bytes_]) -> tuple[Array, Array]:
+def _read_poses(tables: Path, pose_tokens: NDArray[np.bytes_]) -> tuple[Array, Array]:
     """Translations (P, 3), metres, and quaternions (P, 4) of world_from_ego for the pose tokens (P,)."""
     path = tables / "ego_pose.json"
-    needed = {token.decode() for token in wanted}
+    needed = {token.decode() for token in pose_tokens}
     parts = []
     for batch in read_batches(path):
         rows = batch.where(token in needed for token in batch.texts("token"))
         parts.append((rows.tokens("token"), rows.vectors("translation", 3), rows.quaternions("rotation")))
     tokens, translations, rotations = map(np.concatenate, zip(*parts, strict=True))
-    places = places_of(wanted, tokens, path)
-    chosen = rotations[places]
-    return translations[places], chosen / np.linalg.norm(chosen, axis=1, keepdims=True)
+    places = places_of(pose_tokens, tokens, path)
+    quaternions = rotations[places]
+    return translations[places], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
 
 
 def _starts(sorted_owners: Ints, count: int) -> Ints:
@@ -327,18 +327,18 @@ def _read_annotations(
     batches = read_batches(path) if path.is_file() else [Rows(path, [])]
     columns = _joined([_columns(batch, names) for batch in batches])
     samples = places_of(columns.pop("samples"), sample_tokens, tables / "sample.json")
-    own, times_us = columns.pop("tokens"), sample_times_us[samples]
-    first, last = (_linked(columns.pop(name), own, path) for name in ("prev", "next"))
+    tokens, times_us = columns.pop("tokens"), sample_times_us[samples]
+    first, last = (_linked(columns.pop(name), tokens, path) for name in ("prev", "next"))
     seconds = (times_us - times_us[:1]).astype(np.float64) * 1e-6
     columns["velocities"] = velocities_between(columns["centers"], seconds, first, last)[:, :2]
     order = np.argsort(samples, kind="stable")
     return Annotations(**_rows(columns, order)), _starts(samples[order], len(sample_tokens))
 
 
-def _linked(wanted: NDArray[np.bytes_], own: NDArray[np.bytes_], path: Path) -> Ints:
+def _linked(linked: NDArray[np.bytes_], tokens: NDArray[np.bytes_], path: Path) -> Ints:
     """(A,) rows of the annotations with the wanted tokens (A,); the own row for an empty one. own: (A,) tokens."""
-    rows, stated = np.arange(len(own)), wanted != b""
-    rows[stated] = places_of(wanted[stated], own, path)
+    rows, is_linked = np.arange(len(tokens)), linked != b""
+    rows[is_linked] = places_of(linked[is_linked], tokens, path)
     return rows
 
 
@@ -383,7 +383,7 @@ def _num_points(rows: Rows) -> Ints:
 
 def _columns(rows: Rows, names: _Names) -> Columns:
     attributes = rows.column("attribute_tokens")
-    if not all(type(own) is list and all(type(token) is str for token in own) for own in attributes):
+    if not all(type(ids) is list and all(type(token) is str for token in ids) for ids in attributes):
         raise InputError(f'{rows.path}: "attribute_tokens": expected a list of tokens in every row')
     return {
         "tokens": rows.tokens("token"),
@@ -391,7 +391,7 @@ def _columns(rows: Rows, names: _Names) -> Columns:
         "prev": rows.tokens("prev"),
         "next": rows.tokens("next"),
         "categories": np.array([names.category.get(token, b"") for token in rows.texts("instance_token")], dtype="S"),
-        "attributes": np.array([names.attribute.get(own[0], b"") if own else b"" for own in attributes], dtype="S"),
+        "attributes": np.array([names.attribute.get(ids[0], b"") if ids else b"" for ids in attributes], dtype="S"),
         "instances": rows.tokens("instance_token"),
         "centers": rows.vectors("translation", 3),
         "sizes_wlh": rows.vectors("size", 3),
@@ -407,8 +407,8 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
         return build_index(tables, dialect), ""
     name = hashlib.sha256(str(tables.resolve()).encode()).hexdigest()[:16]
     folder = user_cache() / "nuscenes" / f"{tables.name}-{name}"
-    facts = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
-    fingerprint = json.dumps({"format": CACHE_FORMAT, "tables": facts})
+    states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
+    fingerprint = json.dumps({"format": CACHE_FORMAT, "tables": states})
     with suppress(OSError, ValueError, EOFError):  # there is no cache, or it is damaged
         if (folder / FINGERPRINT).read_text(encoding="utf-8") == fingerprint:
             return _load(folder), ""
@@ -425,9 +425,9 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
-    for part, table in vars(index).items():
+    for group, table in vars(index).items():
         for name, values in vars(table).items():
-            np.save(unfinished / f"{part}.{name}.npy", values, allow_pickle=False)
+            np.save(unfinished / f"{group}.{name}.npy", values, allow_pickle=False)
     (unfinished / FINGERPRINT).write_text(fingerprint, encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
@@ -435,10 +435,10 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
 
 def _load(folder: Path) -> NuScenesIndex:
     parts: dict[str, Any] = {}
-    for name, kind in get_type_hints(NuScenesIndex).items():
+    for name, cls in get_type_hints(NuScenesIndex).items():
         columns = {
             column.name: np.load(folder / f"{name}.{column.name}.npy", mmap_mode="r", allow_pickle=False)
-            for column in fields(kind)
+            for column in fields(cls)
         }
-        parts[name] = kind(**columns)
+        parts[name] = cls(**columns)
     return NuScenesIndex(**parts)

@@ -60,20 +60,20 @@ def batch(
     Raises BevcliError: see `Batch`.
     """
     kinds = (BatchOptions, Workers, ModelOptions, RunOptions, RecordingOptions, InputOptions)
-    chosen, workers, model, run_options, recording, input_options, format_values = spread(
+    batch_options, workers, model, run_options, recording, input_options, format_values = spread(
         options | {"out": str(out)}, *kinds
     )
     names = {name for form in formats() for name in defaults(form)}
     if format_values.keys() - names:
         raise TypeError(f"batch() has no option {min(format_values.keys() - names)}")
-    if chosen.retry_failed and not chosen.resume:
+    if batch_options.retry_failed and not batch_options.resume:
         raise InputError("`retry_failed` (`--retry-failed`): is for `resume=True` (`--resume`)")
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
     if "recording" not in options:
         run_options = replace(run_options, recording=recording)
-    job = job_of(chosen, workers, model, run_options)
+    job = job_of(batch_options, workers, model, run_options)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
-    prepared = prepare_batch(job, loaded, list(map(str, texts)), chosen, workers, input_options, format_values)
+    prepared = prepare_batch(job, loaded, list(map(str, texts)), batch_options, workers, input_options, format_values)
     for _ in prepared.run():
         pass
     return prepared.summary

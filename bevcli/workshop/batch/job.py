@@ -226,14 +226,14 @@ class Job:
         """The model with its weights. Raises BevcliError."""
         return load_model(options=self.model)
 
-    def own_of(self, kind: type[Own]) -> Own:
-        """The own options of a format. kind: their dataclass."""
-        return next((options for options in self.own if type(options) is kind), kind())
+    def own_of(self, options_type: type[Own]) -> Own:
+        """The own options of a format. options_type: their dataclass."""
+        return next((options for options in self.own if type(options) is options_type), options_type())
 
     def open(self, path: Path, scene: str | None) -> Drive:
         """A drive, or a scene of it. Raises InputError."""
-        own = self.own_of(format_of(path))
-        return open_sequence(path, replace(self.source, scene=scene), **vars(own))
+        format_options = self.own_of(format_of(path))
+        return open_sequence(path, replace(self.source, scene=scene), **vars(format_options))
 
     def check_options(self, drives: Iterable[BatchDrive]) -> None:
         """Raise InputError for an option that no format of the drives has. One at a URL may have any format."""

@@ -172,34 +172,34 @@ def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> Fr
 
 def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
     """The matching of one class in all drives. Equal scores stay in the order of a joint matching."""
-    starts = np.cumsum([0, *(len(part.ground_truth) for part in parts)])
+    starts = np.cumsum([0, *(len(matches.ground_truth) for matches in parts)])
     moved = [np.where(p.matched < 0, -1, p.matched + start) for p, start in zip(parts, starts, strict=False)]
     # Of equal scores the later one is first, as in `descending_scores`: the last drive comes first.
-    predictions = _concatenated([part.predictions for part in parts[::-1]])
+    predictions = _concatenated([matches.predictions for matches in parts[::-1]])
     order = np.argsort(-predictions.column("scores"), kind="stable")
     return ClassMatches(
         parts[0].name,
-        _concatenated([part.ground_truth for part in parts]),
+        _concatenated([matches.ground_truth for matches in parts]),
         predictions[order],
         np.concatenate(moved[::-1], axis=1)[:, order],
-        np.concatenate([part.truth_counts for part in parts]),
-        np.concatenate([part.counts for part in parts[::-1]], axis=1)[:, order],
+        np.concatenate([matches.truth_counts for matches in parts]),
+        np.concatenate([matches.counts for matches in parts[::-1]], axis=1)[:, order],
     )
 
 
 def _concatenated(parts: Sequence[ScoredBoxes]) -> ScoredBoxes:
     """The boxes of all drives; their frames are not numbered anew."""
-    boxes = with_all_columns(Boxes3D.concatenate(part.boxes for part in parts))
-    frames = np.concatenate([part.frames for part in parts])
-    return ScoredBoxes(boxes, frames, np.concatenate([part.ranges_m for part in parts]))
+    boxes = with_all_columns(Boxes3D.concatenate(scored.boxes for scored in parts))
+    frames = np.concatenate([scored.frames for scored in parts])
+    return ScoredBoxes(boxes, frames, np.concatenate([scored.ranges_m for scored in parts]))
 
 
-def _merged_maps(parts: Sequence[SegmentationScores]) -> SegmentationScores:
-    names = dict.fromkeys(name for part in parts for name in part.union)
+def _merged_maps(drives: Sequence[SegmentationScores]) -> SegmentationScores:
+    names = dict.fromkeys(name for scores in drives for name in scores.union)
     return SegmentationScores(
-        {name: sum(part.intersection.get(name, 0.0) for part in parts) for name in names},
-        {name: sum(part.union.get(name, 0.0) for part in parts) for name in names},
-        sum(part.frame_count for part in parts),
+        {name: sum(scores.intersection.get(name, 0.0) for scores in drives) for name in names},
+        {name: sum(scores.union.get(name, 0.0) for scores in drives) for name in names},
+        sum(scores.frame_count for scores in drives),
     )
 
 
@@ -296,15 +296,15 @@ def _errors(failed: Sequence[Record]) -> str:
     return f"<h2>Errors</h2><p>Failed drives: {len(failed):,}</p>{table}{note}"
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], kind: str = "wide") -> str:
-    """A table. rows: cells as HTML. numbers: columns with numbers. kind: "narrow" is only as wide as its cells."""
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int], style: str = "wide") -> str:
+    """A table. rows: cells as HTML. numbers: columns with numbers. style: "narrow" is only as wide as its cells."""
     lines = [("th", [escape(text) for text in head]), *(("td", row) for row in rows)]
     classes = ["number" if column in numbers else "text" for column in range(len(head))]
     body = "".join(
         "<tr>" + "".join(f'<{tag} class="{c}">{text}</{tag}>' for c, text in zip(classes, row, strict=True)) + "</tr>"
         for tag, row in lines
     )
-    return f'<div class="scroll"><table class="{kind}">{body}</table></div>'
+    return f'<div class="scroll"><table class="{style}">{body}</table></div>'
 
 
 def _number(value: float | None) -> str:

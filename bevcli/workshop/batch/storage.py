@@ -128,8 +128,8 @@ class LocalFolder:
 class RemoteFolder:
     """A folder in an object store, with the methods of `LocalFolder`. Raises BevcliError where a package is missing."""
 
-    def __init__(self, where: str) -> None:
-        self.where = where.rstrip("/")
+    def __init__(self, url: str) -> None:
+        self.where = url.rstrip("/")
         self._system, path = _filesystem(self.where)
         self._root = str(path).rstrip("/")
 
@@ -185,8 +185,8 @@ class RemoteFolder:
                 local.parent.mkdir(parents=True, exist_ok=True)
                 self._system.get_file(self._root, str(local))
                 return
-            wanted = [file.name for file in self.files()] if names is None else names
-            list(pool.map(lambda name: self._fetch_file(name, local, may_be_missing=names is not None), wanted))
+            fetched = [file.name for file in self.files()] if names is None else names
+            list(pool.map(lambda name: self._fetch_file(name, local, may_be_missing=names is not None), fetched))
 
     def _fetch_file(self, name: str, local: Path, *, may_be_missing: bool) -> None:
         inside = PurePosixPath(name)
@@ -207,9 +207,9 @@ class RemoteFolder:
 Storage = LocalFolder | RemoteFolder
 
 
-def open_storage(where: str) -> Storage:
+def open_storage(address: str) -> Storage:
     """The folder of a path or URL. Raises BevcliError where a package for the protocol is not installed."""
-    return RemoteFolder(where) if is_url(where) else LocalFolder(Path(where.removeprefix("file://")))
+    return RemoteFolder(address) if is_url(address) else LocalFolder(Path(address.removeprefix("file://")))
 
 
 def _stored(path: Path, name: str) -> StoredFile:
@@ -241,13 +241,13 @@ def _filesystem(url: str) -> tuple[Any, str]:
 
 
 @contextlib.contextmanager
-def _one_line(where: str, kind: type[BevcliError]) -> Iterator[None]:
+def _one_line(url: str, error_type: type[BevcliError]) -> Iterator[None]:
     """Make one error of one line of what the packages of object stores raise, which have errors of many types."""
     try:
         yield
     except FileNotFoundError:
-        raise kind(f"{where}: is missing") from None
+        raise error_type(f"{url}: is missing") from None
     except (BevcliError, ImportError):
         raise
     except Exception as error:
-        raise kind(f"{where}: the storage cannot be used ({reason_of(error):.200})") from None
+        raise error_type(f"{url}: the storage cannot be used ({reason_of(error):.200})") from None

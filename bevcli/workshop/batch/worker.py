@@ -138,8 +138,8 @@ class Worker:
 
     def _score(self, drive: BatchDrive, path: Path, aside: Path) -> tuple[Scores | None, str]:
         """The scores of a drive's predictions, or None and why there are none; "" without ground truth."""
-        chosen = format_of(path)
-        if not self._job.evaluate or not (chosen.annotated or is_there(path / "ground_truth.json")):
+        input_format = format_of(path)
+        if not self._job.evaluate or not (input_format.annotated or is_there(path / "ground_truth.json")):
             return None, ""
         version = self._job.own_of(NuScenesOptions).version if drive.scene else None
         class_map = self._job.source.class_map
@@ -171,8 +171,8 @@ class Worker:
         aside = inputs / "result"
         if isinstance(self._out, storage.LocalFolder):
             attempts = self._out.path / storage.ATTEMPTS
-            for left in attempts.glob(f"{result}.*.run"):  # of a worker that died
-                shutil.rmtree(left, ignore_errors=True)
+            for abandoned in attempts.glob(f"{result}.*.run"):  # of a worker that died
+                shutil.rmtree(abandoned, ignore_errors=True)
             aside = attempts / f"{result}.{uuid.uuid4().hex[:8]}.run"
         try:
             yield aside, inputs / "input"
@@ -234,11 +234,11 @@ def _with_final_paths(message: str, *pairs: tuple[Path, str]) -> str:
     return message
 
 
-def _rewrite_paths(aside: Path, where: str) -> None:
+def _rewrite_paths(aside: Path, target: str) -> None:
     """Names the final paths in summary.json."""
     path = aside / SUMMARY
     content = json.loads(path.read_text(encoding="utf-8"))
-    content["files"] = [_with_final_paths(name, (aside, where)) for name in content["files"]]
+    content["files"] = [_with_final_paths(name, (aside, target)) for name in content["files"]]
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -347,8 +347,8 @@ def _ray(workers: Workers) -> Iterator[Any]:
     try:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env=environment, **options)
     except Exception as error:  # Ray raises errors of many types where it cannot start or connect
-        where = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
-        raise BevcliError(f"Ray: {where} ({reason_of(error)[:200]}); `count=1` (`--workers 1`) needs no Ray") from None
+        reason = f"the cluster {workers.address} cannot be reached" if workers.address else "cannot be started"
+        raise BevcliError(f"Ray: {reason} ({reason_of(error)[:200]}); `count=1` (`--workers 1`) needs no Ray") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, on_terminate)  # Ray installs its own handler
     try:

@@ -90,7 +90,7 @@ def made_up_model(config: ModelConfig) -> Network:
                     nn.init.constant_(parameter, RESIDUAL_GAIN)
                 elif parameter.ndim > 1 and not parameter.any():
                     nn.init.normal_(parameter, std=0.5 / math.sqrt(parameter[0].numel()))
-            first = next(part for part in model.backbone.modules() if isinstance(part, nn.Conv2d))
+            first = next(module for module in model.backbone.modules() if isinstance(module, nn.Conv2d))
             first.weight *= sum(config.image.std) / 3 / USUAL_DEVIATION
     return model
 

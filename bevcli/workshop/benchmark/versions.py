@@ -253,7 +253,7 @@ def compare_engines(model: str, frames: int) -> EngineTable:
     versions: dict[tuple[str, Any], Version] = {}
     failed: list[EngineRow] = []
     network, drive = made_up_model(config), MadeUpDrive(CALIBRATION_FRAMES)
-    kinds: dict[str, Any] = {name: kind.precisions for name, kind in installed_engines().items()}
+    kinds: dict[str, Any] = {name: engine_class.precisions for name, engine_class in installed_engines().items()}
     pairs = (
         (engine, precision)
         for engine, precisions in ({TORCH: ("fp32", "bf16")} | kinds).items()

@@ -113,8 +113,8 @@ class BEVFormerV2(Network):
         first.temporal_self_attention = ConstantTemporalSelfAttention(self.encoder, self.bev_queries)
         for layer in others:
             assert isinstance(layer, EncoderLayer)
-            own = OwnQueriesAttention(layer.temporal_self_attention, self.bev_queries.position())
-            layer.set_submodule("temporal_self_attention", own)
+            attention = OwnQueriesAttention(layer.temporal_self_attention, self.bev_queries.position())
+            layer.set_submodule("temporal_self_attention", attention)
         self.decoder.fix_first_attention()
 
     def bev_part_names(self) -> Iterator[tuple[str, ...]]:

@@ -69,12 +69,12 @@ class Unknowns:
     def geometry(self, local: Array) -> GroupGeometry:
         """The geometry of all groups. local: (G, 20), the values of `columns`."""
         of_a, of_b, turn, rig = np.split(local, np.cumsum([OF_CAMERA, OF_CAMERA, OF_PAIR]), axis=-1)
-        (_, first, second), stated = self.groups.T, self.stated
+        (_, first, second), ego_from_camera = self.groups.T, self.stated
         before, after = (_pose_at(self.poses[:, side], camera[:, 6]) for side, camera in enumerate((of_a, of_b)))
         motion = inverse(after) @ before
         motion[:, :3, :3] = motion[:, :3, :3] @ Rotation.from_rotvec(turn * self.moves[:, None]).as_matrix()
         motion[:, :3, 3] *= 1 + rig[:, :1]
-        pose_a, pose_b = moved(stated[first], of_a), moved(stated[second], of_b)
+        pose_a, pose_b = moved(ego_from_camera[first], of_a), moved(ego_from_camera[second], of_b)
         pose_a[:, :3, :3] = Rotation.from_rotvec(turn * ~self.moves[:, None]).as_matrix() @ pose_a[:, :3, :3]
         return GroupGeometry(pose_a, pose_b, motion, rig[0, 1:])
 

@@ -269,16 +269,16 @@ def calibration_steps(drive: Drive, options: CalibrateOptions) -> Iterator[Calib
 def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
     """The result of a measurement: what is observed, with a verdict for each camera."""
     changes, covariances, whole = observed(measurement)
-    stated, unknowns, pairs = measurement.views.stated, measurement.unknowns, len(measurement.views.pairs)
+    stated_rig, unknowns, pairs = measurement.views.stated, measurement.unknowns, len(measurement.views.pairs)
     cameras = tuple(_estimate(index, measurement, changes[index], covariances[index]) for index in range(len(changes)))
     corrected = tuple(
         replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
         for camera, pose, estimate in zip(
-            stated.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
+            stated_rig.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
         )
     )
-    rig = replace(stated, cameras=corrected)
-    return CalibrationResult(drive.name, stated, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
+    rig = replace(stated_rig, cameras=corrected)
+    return CalibrationResult(drive.name, stated_rig, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
 
 
 def _even_interval_ms(drive: Drive) -> float | None:
@@ -332,8 +332,8 @@ def _reason(
     width_px = camera.width * max(np.sqrt(FEWEST_MATCHES / max(matches, 1)), widest / WIDEST_DEG)
     width = int(min(WIDTH, 10 * np.ceil(width_px / 10)))
     height = round(camera.height * width / camera.width)
-    stated = f"{camera.width} x {camera.height}"
-    size = f"; its images are {stated}: about {width} x {height} would do" if width > camera.width else ""
+    pixels = f"{camera.width} x {camera.height}"
+    size = f"; its images are {pixels}: about {width} x {height} would do" if width > camera.width else ""
     if matches < FEWEST_MATCHES:
         return f"{matches} matches{size}"
     if pairs < FEWEST_PAIRS:
@@ -345,8 +345,8 @@ def _reason(
     if turned_deg < LEAST_TURNED_DEG and ahead[deviations_deg.argmax()] > MOSTLY:
         return f"{shown}: the road shows too little, and the vehicle turns too little; a turn at a junction would do"
     if width_px > WIDTH > camera.width:
-        left = widest * camera.width / WIDTH
-        size = f"; its images are {stated}: {width} x {height} would show about ±{left:.1f}°, and a longer drive less"
+        deg = widest * camera.width / WIDTH
+        size = f"; its images are {pixels}: {width} x {height} would show about ±{deg:.1f}°, and a longer drive less"
     return f"{shown}{size}"
 
 

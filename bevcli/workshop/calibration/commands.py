@@ -35,8 +35,8 @@ def calibrate(
     count, measure = at_once.STEPS, at_once.calibration_steps
     if source.odometry:
         count, measure = in_turn.ALL_STEPS, in_turn.calibrate_in_turn
-    reading = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
-    drive = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
+    input_options = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
+    drive = bevcli.open_sequence(sequence, input_options, ground_truth=False, **format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
     with Progress(count, "steps", drive.notes) as progress:

@@ -1,9 +1,6 @@
 """The options `calibrate` of `bevcli run` and `motion` of `bevcli project-debug`."""
 
-from collections.abc import Callable
-
 from bevcli.cli.progress import Progress
-from bevcli.errors import InputError
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.printing import say
@@ -23,11 +20,9 @@ def corrected(drive: Drive) -> Drive:
     return DriveView(drive, rig=result.rig)
 
 
-def check_motion(open_drive: Callable[[], Drive]) -> tuple[Finding, ...]:
-    """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone."""
-    try:
-        drive = open_drive()
-    except InputError:  # the check has said so
+def check_motion(drive: Drive | None) -> tuple[Finding, ...]:
+    """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone (None)."""
+    if drive is None:
         return ()
     motion = stated_motion_findings(drive)
     if errors_of(motion):  # which make a calibration wrong

@@ -38,12 +38,12 @@ def calibrate_in_turn(drive: Drive, options: CalibrateOptions) -> Iterator[Calib
     """
     rig, rounds = drive.rig, 0
     while True:
-        part = at_most_rate(DriveView(drive, rig=rig))
-        steps, total = list[MeasuredStep](), max(len(part.stamps) - 1, 1)
-        for step in measure_steps(part):
+        sampled = at_most_rate(DriveView(drive, rig=rig))
+        steps, total = list[MeasuredStep](), max(len(sampled.stamps) - 1, 1)
+        for step in measure_steps(sampled):
             steps.append(step)
             yield from steps_reached(MOTION_STEPS, len(steps), total)
-        motion = MeasuredMotion.of(part, steps)
+        motion = MeasuredMotion.of(sampled, steps)
         check_measured(motion)
         moving = DriveView(drive, rig=drive.rig, motions={drive.stamps[0].scene: motion.ego_motion})
         for result in calibration_steps(moving, options):

@@ -105,7 +105,7 @@ def road_residuals(
     signals: (C,) `least_signal` of `road_points` for each camera. Where it is above 0, only points near the vehicle's
     way count: farther beside are kerbs, grass and parked cars, which look like a road that is tilted.
     """
-    chosen, geometry = unknowns.within_camera if groups is None else groups, geometry_at(unknowns, x)
+    indices, geometry = unknowns.within_camera if groups is None else groups, geometry_at(unknowns, x)
 
     def of_group(group: int) -> RoadPoints:
         pair, index, _ = (int(number) for number in unknowns.groups[group])
@@ -113,10 +113,10 @@ def road_residuals(
         return road_points(views.rig.cameras[index], (first, second), geometry, group, most_px, signals[index])
 
     with ThreadPoolExecutor(THREADS) as threads:
-        parts = list(threads.map(of_group, chosen))
-    counts = [len(part.rays_a) for part in parts]
-    columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
-    road = RoadResiduals(np.repeat(chosen, counts), *columns)
+        parts = list(threads.map(of_group, indices))
+    counts = [len(points.rays_a) for points in parts]
+    columns = (np.concatenate([getattr(points, field.name) for points in parts]) for field in fields(RoadPoints))
+    road = RoadResiduals(np.repeat(indices, counts), *columns)
     return road.where((road.beside_m < LANE_M) | (signals == 0)[unknowns.groups[road.group, 1]])
 
 

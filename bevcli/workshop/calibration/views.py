@@ -91,7 +91,7 @@ def read_views(drive: Drive, most_pairs: int) -> Generator[None, None, Views]:
     for done, frame_index in enumerate(frames, 1):
         frame = drive.load(frame_index)
         if done == 1:
-            stated, rig = frame.rig, replace(frame.rig, cameras=tuple(map(reduced, frame.rig.cameras)))
+            stated_rig, rig = frame.rig, replace(frame.rig, cameras=tuple(map(reduced, frame.rig.cameras)))
         for index, camera in enumerate(rig.cameras):
             view = _view(frame, camera, drive.ego_motion)
             if view is not None:
@@ -99,7 +99,7 @@ def read_views(drive: Drive, most_pairs: int) -> Generator[None, None, Views]:
         yield from steps_reached(READING_STEPS, done, len(frames))
     if not views:
         raise InputError(f"{drive.name}: no image shows anything (expected images with contrast, not black ones)")
-    return Views(stated, rig, tuple(pairs), views)
+    return Views(stated_rig, rig, tuple(pairs), views)
 
 
 def steps_reached(steps: int, done: int, total: int) -> list[None]:
@@ -149,10 +149,10 @@ def _choose_pairs(positions: tuple[list[int], Array], most: int) -> list[tuple[i
         anchor = k
     if len(pairs) <= most:
         return pairs
-    chosen = set(np.argsort(turns)[::-1][: most // 2].tolist())
-    rest = [k for k in range(len(pairs)) if k not in chosen]
-    chosen |= {rest[int(k)] for k in np.linspace(0, len(rest) - 1, most - len(chosen))}
-    return [pairs[k] for k in sorted(chosen)]
+    selected = set(np.argsort(turns)[::-1][: most // 2].tolist())
+    rest = [k for k in range(len(pairs)) if k not in selected]
+    selected |= {rest[int(k)] for k in np.linspace(0, len(rest) - 1, most - len(selected))}
+    return [pairs[k] for k in sorted(selected)]
 
 
 def _view(frame: Frame, camera: Camera, motion: EgoMotion | None) -> View | None:
@@ -163,10 +163,10 @@ def _view(frame: Frame, camera: Camera, motion: EgoMotion | None) -> View | None
 
 def _poses(frame: Frame, name: str, motion: EgoMotion | None) -> Array:
     """World_from_ego (25, 4, 4) at the camera's time and DELAYS_S later."""
-    time, stated = frame.images[name].timestamp_ns, frame.world_from_ego_at[name].matrix
+    time, stated_pose = frame.images[name].timestamp_ns, frame.world_from_ego_at[name].matrix
     poses = []
     for delay in DELAYS_S:
-        nearest, beyond_s = stated, delay
+        nearest, beyond_s = stated_pose, delay
         if motion is not None:
             delayed = time + round(delay * 1e9)
             within = min(max(delayed, motion.first_ns), motion.last_ns)
@@ -184,13 +184,13 @@ def unknowns_of(views: Views, options: CalibrateOptions) -> Unknowns:
     groups = [group for group, _ in views.all_groups()]
     poses = np.stack([[_quaternions(view.poses) for view in views.sides(*group)] for group in views.all_groups()])
     poses[..., 4:] -= poses[:, :1, :1, 4:]
-    stated = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
+    ego_from_camera = np.stack([camera.ego_from_camera for camera in views.rig.cameras])
     pairs, beside = len(views.pairs), views.beside()
     turns = [group[0] if moves else pairs + beside.index(group[1:]) for group, moves in views.all_groups()]
     of_camera = [np.radians(options.rotation_deg)] * 3 + [options.position_m] * 3 + [DELAY_S]
     of_turns = [np.full(OF_PAIR * pairs, np.radians(options.turn_deg)), np.tile(LENSES, len(beside))]
-    deviations = np.concatenate([np.tile(of_camera, len(stated)), *of_turns, [options.scale, TILT, TILT]])
-    return Unknowns(stated, poses, np.array(groups), np.array(turns), pairs, len(beside), deviations)
+    deviations = np.concatenate([np.tile(of_camera, len(ego_from_camera)), *of_turns, [options.scale, TILT, TILT]])
+    return Unknowns(ego_from_camera, poses, np.array(groups), np.array(turns), pairs, len(beside), deviations)
 
 
 def _quaternions(poses: Array) -> Array:

@@ -78,11 +78,11 @@ def _lines(title: str, fact: Facts) -> Iterator[str]:
 
 def versions() -> Facts:
     """Those of bevcli, Python and the system."""
-    kind = " of a checkout" if (Path(__file__).parents[3] / "pyproject.toml").is_file() else ""
+    origin = " of a checkout" if (Path(__file__).parents[3] / "pyproject.toml").is_file() else ""
     metadata = installed("bevcli")
     if metadata != __version__:  # an editable installation keeps the requirements of its day
-        kind += f" (its metadata are of {metadata or 'no version'}: install it again)"
-    return f"{__version__}{kind}, Python {platform.python_version()}, {platform.platform()}"
+        origin += f" (its metadata are of {metadata or 'no version'}: install it again)"
+    return f"{__version__}{origin}, Python {platform.python_version()}, {platform.platform()}"
 
 
 def required() -> Iterator[tuple[str, str]]:
@@ -128,9 +128,9 @@ def viewer() -> Facts:
 def _vulkan() -> str:
     if not sys.platform.startswith("linux"):
         return "by the system's graphics driver"
-    stated = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    listed = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
     folders = [Path(folder, "vulkan/icd.d") for folder in ("/usr/share", "/usr/local/share", "/etc")]
-    files = stated.split(":") if stated else [str(file) for folder in folders for file in sorted(folder.glob("*.json"))]
+    files = listed.split(":") if listed else [str(file) for folder in folders for file in sorted(folder.glob("*.json"))]
     if not files:
         return "no Vulkan driver (Debian, Ubuntu: apt-get install mesa-vulkan-drivers)"
     return f"Vulkan drivers {', '.join(Path(file).name.partition('.')[0] for file in files)}"

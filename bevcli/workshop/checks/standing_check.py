@@ -64,8 +64,8 @@ def _small_images(frame: Frame) -> dict[str, Gray]:
     if not yaws:
         return {}
     first = next(iter(yaws))
-    chosen = {first, min(yaws, key=lambda name: np.cos(yaws[name] - yaws[first]))}
-    return {name: _small(frame.images[name].pixels_bgr) for name in chosen}
+    names = {first, min(yaws, key=lambda name: np.cos(yaws[name] - yaws[first]))}
+    return {name: _small(frame.images[name].pixels_bgr) for name in names}
 
 
 def _small(pixels_bgr: NDArray[np.uint8]) -> Gray:

@@ -47,20 +47,18 @@ def kernels() -> str | dict[str, str]:
     choose_kernels(network, device)
     kinds = {type(part) for part in network.modules()}
     kinds |= {type(sampling) for part in network.modules() if (sampling := getattr(part, "sampling", None)) is not None}
-    chosen = sorted(kind.__name__ for kind in kinds if kind.__module__.startswith("bevcli.model.kernels"))
+    names = sorted(kind.__name__ for kind in kinds if kind.__module__.startswith("bevcli.model.kernels"))
     if device.type == "cpu":
         why = "loops compiled by numba, as no GPU is there"
         products = "oneDNN" if has_onednn(torch.float32) else "plain PyTorch, as this build lacks operators of oneDNN"
     else:
         why = "Triton" if has_triton(device) else "plain PyTorch, as Triton is not installed or the GPU is not of CUDA"
         products = "PyTorch, replayed as CUDA graphs" if device.type == "cuda" else "PyTorch"
-    found = {"attention": f"{', '.join(chosen) or 'as in the paper'} ({why})", "convolutions": products}
+    rows = {"attention": f"{', '.join(names) or 'as in the paper'} ({why})", "convolutions": products}
     if device.type == "cpu":
         parts = "images and products of encoder and decoder (AMX)" if has_matrix_unit() else "images only (no AMX)"
-        found["bf16"] = (
-            f"for {parts}" if has_onednn(torch.bfloat16) else "slow: the processor lacks instructions for it"
-        )
-    return found
+        rows["bf16"] = f"for {parts}" if has_onednn(torch.bfloat16) else "slow: the processor lacks instructions for it"
+    return rows
 
 
 def engines() -> str | dict[str, str]:

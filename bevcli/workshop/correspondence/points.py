@@ -67,13 +67,13 @@ def matched(a: Features, b: Features, first: Camera, second: Camera, *, at_once:
         good = (rays_a[:, 2] > FLATTEST) & (rays_b[:, 2] > FLATTEST)
     if at_once or first.name == second.name:
         good[good] = _rigid(rays_a[good], rays_b[good], first)
-    chosen = np.flatnonzero(good)
+    indices = np.flatnonzero(good)
     # SIFT gives a point with several orientations several times.
-    chosen = chosen[np.sort(np.unique(pixels_a[chosen].astype(int), axis=0, return_index=True)[1])]
-    chosen = chosen[_spread(pixels_a[chosen], quality[chosen].astype(np.float64), first)]
-    if at_once and len(chosen) < FEWEST_AT_ONCE:
+    indices = indices[np.sort(np.unique(pixels_a[indices].astype(int), axis=0, return_index=True)[1])]
+    indices = indices[_spread(pixels_a[indices], quality[indices].astype(np.float64), first)]
+    if at_once and len(indices) < FEWEST_AT_ONCE:
         return nothing
-    return rays_a[chosen], rays_b[chosen]
+    return rays_a[indices], rays_b[indices]
 
 
 def _nearest(

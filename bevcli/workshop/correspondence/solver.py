@@ -185,8 +185,8 @@ def honest_covariance(parameters: Parameters, solution: Solution, parts: Indices
     matrix = solution.information + prior
     covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     pulls = []
-    for part in np.unique(parts):
-        groups = parts == part
+    for number in np.unique(parts):
+        groups = parts == number
         pulls.append(np.linalg.solve(matrix - solution.information_of(groups), solution.gradient_of(groups)))
     agreed = (np.square(pulls).sum(0) + np.diag(covariance @ prior @ covariance)) / np.diag(covariance)
     factor = np.sqrt(np.maximum(agreed, LEAST_FACTOR))

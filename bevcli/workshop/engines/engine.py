@@ -315,7 +315,7 @@ def _calibration_frames(model: Model, drive: Drive | None) -> Drive:
 def _key(sized: Model, options: OnnxOptions, precision: str, frames: int = 0) -> str:
     """Hash of all that a file depends on. frames: number of those that calibrate it."""
     other = sized.calibrate_with if precision == "int8" else None
-    facts = {
+    inputs = {
         "version": (__version__, FORMAT),
         "weights": sized.weights_hash,
         "model": sized.config_hash,
@@ -324,7 +324,7 @@ def _key(sized: Model, options: OnnxOptions, precision: str, frames: int = 0) ->
         "precision": precision,
         "calibration": (frames, None if other is None else str(other.resolve())),
     }
-    return hash_of_values(facts)[:KEY_DIGITS]
+    return hash_of_values(inputs)[:KEY_DIGITS]
 
 
 class FileFacts(msgspec.Struct, frozen=True):
@@ -380,8 +380,8 @@ class CachedFile:
     def opened(self, engine: type[Engine], calibrated_with: str = "") -> CachedNetwork:
         """The file in an engine, after it was written; its facts are kept beside it."""
         network = engine.open(self.path)
-        facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
-        write_whole(self.facts_path, msgspec.json.encode(facts), shared=True)
+        file_facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
+        write_whole(self.facts_path, msgspec.json.encode(file_facts), shared=True)
         return CachedNetwork(network, calibrated_with)
 
 
@@ -391,15 +391,15 @@ def _load(file: CachedFile, engine: type[Engine], stamp: object) -> CachedNetwor
     if not stamp:
         return None
     try:
-        facts = msgspec.json.decode(read_bytes(file.facts_path, MIB, error=WeightsError), type=FileFacts)
+        file_facts = msgspec.json.decode(read_bytes(file.facts_path, MIB, error=WeightsError), type=FileFacts)
         network = engine.open(file.path)
     except (msgspec.MsgspecError, ValueError, RecursionError, WeightsError, ConfigError):
         return None
-    if bytes(network.digest.tolist()).hex() != facts.sha256:
+    if bytes(network.digest.tolist()).hex() != file_facts.sha256:
         return None
     with suppress(OSError):  # a cache that cannot be written can be read
         os.utime(file.path)
-    return CachedNetwork(network, facts.calibrated_with)
+    return CachedNetwork(network, file_facts.calibrated_with)
 
 
 def _remove_unused(folder: Path) -> None:
@@ -412,7 +412,7 @@ def _remove_unused(folder: Path) -> None:
 
 def _options(sized: Model, rig: CameraRig, deformable_convolution: DeformableConvolution) -> OnnxOptions:
     """The options of a file for a rig: its number of cameras, and the largest number of them that see one cell."""
-    deformable = any(isinstance(part, ModulatedDeformableConvolution) for part in sized.network.modules())
+    deformable = any(isinstance(module, ModulatedDeformableConvolution) for module in sized.network.modules())
     pose = Pose.identity()
     still = Frame(FrameStamp(0, "", 0), rig, {}, pose, dict.fromkeys(rig.names, pose), AT_REST)
     frame = Preprocessor(sized.config)(still)  # without images

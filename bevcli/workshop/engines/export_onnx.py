@@ -119,8 +119,8 @@ def export_onnx(
     proto = program.model_proto
     _document(proto, inputs, outputs)
     contents = as_table(config) if contents is None else contents
-    facts = metadata(form, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
-    onnx.helper.set_model_props(proto, facts)
+    properties = metadata(form, outputs, contents, slots=slots, untrained=untrained, bundled=bundled)
+    onnx.helper.set_model_props(proto, properties)
     onnx.checker.check_model(proto, full_check=True)
     with whole_file(out, parents=True) as unfinished:
         onnx.save(proto, str(unfinished))
@@ -140,7 +140,7 @@ def metadata(
     outputs: of the file. slots: the number of cameras that may see one cell. The others as for `export_onnx`.
     """
     config, image, grid = form.config, form.config.image, form.config.bev_grid
-    facts = {
+    properties = {
         "model": config.name,
         "precision": "fp32",
         "bevcli_version": __version__,
@@ -169,7 +169,7 @@ def metadata(
         "bundled": bundled,
         **form.facts(),
     }
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in facts.items()}
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in properties.items()}
 
 
 def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]) -> None:
@@ -178,12 +178,12 @@ def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]
     for value in (*graph.input, *graph.output):
         value.doc_string = meanings[value.name]
     for node in graph.node:
-        node.name = f"{_part(node)}/{node.name}"
+        node.name = f"{_block_of(node)}/{node.name}"
         # Where a node came from in our source code: a third of the file, and of use to nobody who runs it.
         del node.metadata_props[:]
 
 
-def _part(node: object) -> str:
+def _block_of(node: object) -> str:
     """The part of the network that a node belongs to, such as "backbone.stages.0.0"; "" outside of all parts."""
     scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
     parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
@@ -309,9 +309,9 @@ class CalibrationFeeds:
         (onnx,) = imported("onnx")
         self.images, self.rest = iter(images), {}
         for value in proto.graph.input:
-            kind = value.type.tensor_type
-            shape = [dimension.dim_value for dimension in kind.shape.dim]
-            self.rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+            tensor_type = value.type.tensor_type
+            shape = [dimension.dim_value for dimension in tensor_type.shape.dim]
+            self.rest[value.name] = np.zeros(shape, onnx.helper.tensor_dtype_to_np_dtype(tensor_type.elem_type))
             if shape[-2:] == [4, 4]:  # an embedding of the calibration divides by the determinant
                 self.rest[value.name] += np.eye(4, dtype=self.rest[value.name].dtype)
 
@@ -367,9 +367,9 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Sequence[Drive
     """
     empty = True
     all_frames = [(drive, index) for drive in drives for index in range(len(drive.stamps))]
-    chosen = np.linspace(0, len(all_frames) - 1, min(frames, len(all_frames))).round().astype(int)
+    numbers = np.linspace(0, len(all_frames) - 1, min(frames, len(all_frames))).round().astype(int)
     preprocess = Preprocessor(config, pixels=True)
-    for drive, index in (all_frames[number] for number in chosen):
+    for drive, index in (all_frames[number] for number in numbers):
         prepared = preprocess(drive.load(index))
         if len(prepared.assignment.cameras) != cameras:
             count = counted(len(prepared.assignment.cameras), "cameras")
@@ -380,5 +380,5 @@ def calibration_images(config: ModelConfig, cameras: int, drives: Sequence[Drive
     if empty:
         names = ", ".join(drive.name for drive in drives)
         raise InputError(
-            f"{names}: none of the {len(chosen)} frames for the calibration has an image; add their images"
+            f"{names}: none of the {len(numbers)} frames for the calibration has an image; add their images"
         )

@@ -74,11 +74,11 @@ class ExportedModel(TemporalModel):
         # The only state of this module: it tells a resumed run whether the weights are the same.
         self.register_buffer("digest", torch.tensor(list(digest), dtype=torch.uint8))
 
-    def _require(self, names: Iterable[str], present: Collection[str], kind: str) -> None:
+    def _require(self, names: Iterable[str], present: Collection[str], role: str) -> None:
         missing = [name for name in names if name not in present]
         if missing:
             raise WeightsError(
-                f"{self.file}: has no {kind} {', '.join(missing)} (expected a file of bevcli export-onnx)"
+                f"{self.file}: has no {role} {', '.join(missing)} (expected a file of bevcli export-onnx)"
             )
 
     @property

@@ -31,12 +31,12 @@ def export_onnx(model: Model | str | Path | None = None, **options: Any) -> Path
     Raises BevcliError for a model that cannot be exported, and OutputError where the file exists already.
     """
     of_model = () if isinstance(model, Model) else (ModelOptions,)
-    file, chosen, *model_options, left = spread(options, FileOptions, OnnxOptions, *of_model)
-    refuse(left, "export_onnx", FileOptions, OnnxOptions, *of_model)
-    if chosen.check is not None:
+    file, onnx_options, *model_options, unknown = spread(options, FileOptions, OnnxOptions, *of_model)
+    refuse(unknown, "export_onnx", FileOptions, OnnxOptions, *of_model)
+    if onnx_options.check is not None:
         raise BevcliError("`check`: run a drive through both models, and compare their boxes")
     loaded = model if isinstance(model, Model) else load_model(model, options=replace(model_options[0], device="cpu"))
-    return write_model(loaded, file, chosen)[0]
+    return write_model(loaded, file, onnx_options)[0]
 
 
 def write_model(model: Model, file: FileOptions, options: OnnxOptions) -> tuple[Path, Model]:
@@ -71,8 +71,8 @@ def quantize(
 
     Raises BevcliError for a file that cannot be read, InputError for a drive, and OutputError where the file exists.
     """
-    file, left = spread(options, FileOptions)
-    refuse(left, "quantize", FileOptions)
+    file, unknown = spread(options, FileOptions)
+    refuse(unknown, "quantize", FileOptions)
     return write_quantized(Path(model), tuple(map(Path, drives)), frames, engine or FILE_ENGINE, file)
 
 

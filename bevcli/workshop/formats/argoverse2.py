@@ -80,8 +80,8 @@ class FeatherTable:
             raise InputError(f"{path}: is not a complete Feather file ({reason_of(error)[:200]})") from None
         for name in required:
             if self._table.column_names.count(name) != 1:
-                found = ", ".join(self._table.column_names[:20])
-                raise InputError(f'{path}: has no column "{name:.60}" (found: {found:.200})')
+                columns = ", ".join(self._table.column_names[:20])
+                raise InputError(f'{path}: has no column "{name:.60}" (found: {columns:.200})')
 
     def __len__(self) -> int:
         return int(self._table.num_rows)
@@ -126,28 +126,28 @@ class FeatherTable:
         values = column.to_numpy().astype(np.float64)
         wrong = np.flatnonzero(~(np.abs(values) < LARGEST_NUMBER))
         if len(wrong):
-            found = f"{values[wrong[0]]:g} in row {wrong[0]}"
-            raise InputError(f'{self.path}: column "{name}": expected finite numbers below 1e12, found {found}')
+            description = f"{values[wrong[0]]:g} in row {wrong[0]}"
+            raise InputError(f'{self.path}: column "{name}": expected finite numbers below 1e12, found {description}')
         return values
 
     def _error(self, name: str, expected: str, column: pa.ChunkedArray) -> InputError:
-        found = f"{column.type}{' with missing values' if column.null_count else ''}"
-        return InputError(f'{self.path}: column "{name}": expected {expected}, found {found:.80}')
+        description = f"{column.type}{' with missing values' if column.null_count else ''}"
+        return InputError(f'{self.path}: column "{name}": expected {expected}, found {description:.80}')
 
 
-def open_log(path: Path, common: InputOptions, own: Argoverse2Options) -> ListedDrive:
+def open_log(path: Path, common: InputOptions, options: Argoverse2Options) -> ListedDrive:
     """A log of the Argoverse 2 sensor dataset: a frame for each time that has boxes, 10 per second.
 
     A log without boxes has a frame for each image of the front camera. Each camera contributes its nearest image.
     The ego frame is below Argoverse's, on the ground. The world frame is that of the city. Raises InputError.
     """
     common.refuse_static(path)
-    rig = _read_rig(path / "calibration", own)
-    motion = _read_motion(path / "city_SE3_egovehicle.feather", own.axle_height_m)
+    rig = _read_rig(path / "calibration", options)
+    motion = _read_motion(path / "city_SE3_egovehicle.feather", options.axle_height_m)
     images = {name: _image_times(path / "sensors/cameras" / name) for name in rig.names}
     annotated = (path / ANNOTATIONS).exists()
     names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
-    boxes = _read_annotations(path / ANNOTATIONS, motion, own, names) if annotated else {}
+    boxes = _read_annotations(path / ANNOTATIONS, motion, options, names) if annotated else {}
     entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
     times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
     truth = {index: boxes[time] for index, time in enumerate(times) if time in boxes}
@@ -169,7 +169,7 @@ def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
     return motion_of_keyframes((times[rows], poses[1][rows], quaternions[rows]), poses)
 
 
-def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
+def _read_rig(folder: Path, options: Argoverse2Options) -> CameraRig:
     path, poses_path = folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"
     table = FeatherTable(path, ("sensor_name", *LENS, "width_px", "height_px"))
     lenses = dict(zip(table.texts("sensor_name"), table.numbers(LENS), strict=True))
@@ -177,25 +177,25 @@ def _read_rig(folder: Path, own: Argoverse2Options) -> CameraRig:
     size_of = dict(zip(lenses, sizes.tolist(), strict=True)) if len(lenses) == len(table) else {}
     poses = FeatherTable(poses_path, ("sensor_name", *QUATERNION, *TRANSLATION))
     axle_from = dict(zip(poses.texts("sensor_name"), map(Pose, *poses.poses()), strict=True))
-    names = [name for name in RING if name in lenses] + (list(STEREO) if own.stereo else [])
+    names = [name for name in RING if name in lenses] + (list(STEREO) if options.stereo else [])
     if not names:
         raise InputError(f"{path}: has none of the ring cameras (expected {RING[0]} and others)")
     for name in names:
-        for known, file in ((lenses, path), (size_of, path), (axle_from, poses_path)):
-            if name not in known:
+        for table_of_name, file in ((lenses, path), (size_of, path), (axle_from, poses_path)):
+            if name not in table_of_name:
                 raise InputError(f"{file}: has no row of {name}, or two of one camera (expected one)")
-    ego_from_axle = rigid((0, 0, own.axle_height_m))
+    ego_from_axle = rigid((0, 0, options.axle_height_m))
     ego_from = {name: ego_from_axle @ axle_from[name].matrix for name in names}
-    cameras = [_camera(name, size_of[name], lenses[name], ego_from[name], path, own) for name in names]
+    cameras = [_camera(name, size_of[name], lenses[name], ego_from[name], path, options) for name in names]
     return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
 
 
 def _camera(
-    name: str, size: list[int], lens: Array, ego_from_camera: Array, path: Path, own: Argoverse2Options
+    name: str, size: list[int], lens: Array, ego_from_camera: Array, path: Path, options: Argoverse2Options
 ) -> Camera:
     (width, height), (fx, fy, cx, cy, k1, k2, k3) = size, lens
     intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    distortion = brown_conrady((k1, k2, 0, 0, k3, 0, 0, 0)) if own.distorted else None
+    distortion = brown_conrady((k1, k2, 0, 0, k3, 0, 0, 0)) if options.distorted else None
     return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, distortion), path)
 
 
@@ -206,12 +206,14 @@ def _image_times(folder: Path) -> Times:
     return np.array(sorted(time for time in times if time <= LARGEST_INTEGER), dtype=np.int64)
 
 
-def _read_annotations(path: Path, motion: EgoMotion, own: Argoverse2Options, names: ClassNames) -> dict[int, Boxes3D]:
+def _read_annotations(
+    path: Path, motion: EgoMotion, options: Argoverse2Options, names: ClassNames
+) -> dict[int, Boxes3D]:
     columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
     table = FeatherTable(path, columns)
     translations, quaternions = table.poses()
     boxes = Boxes3D(
-        translations + [0, 0, own.axle_height_m],
+        translations + [0, 0, options.axle_height_m],
         table.numbers(SIZE),
         np.array([yaw_of_rotation(rotation_from_quaternion(q)) for q in quaternions], dtype=np.float64),
         np.full((len(table), 2), np.nan),

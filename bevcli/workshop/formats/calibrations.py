@@ -69,7 +69,7 @@ def read_rig(
         return _guessed_rig(drive, fov_deg, height, yaw_deg)
     if fov_deg is not None:
         raise InputError("`calibration` (`--calibration`) and `fov_deg` (`--fov`) exclude each other: pass one of them")
-    kind, cameras = _stated(calibration)
+    format_name, cameras = _read_cameras(calibration)
     if extrinsics is not None:
         poses = _extrinsics(extrinsics)
         for name in poses.keys() - cameras.keys():
@@ -84,10 +84,10 @@ def read_rig(
         )
         for name, of in cameras.items()
     )
-    text = f"{calibration.name}: {kind}: {counted(len(rig), 'cameras')}; {how}"
+    text = f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}; {how}"
     ego_from_bev = _bev_frame(where)
-    found = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
-    return RigDraft(found, (Finding("calibration-read", "info", None, text),))
+    camera_rig = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
+    return RigDraft(camera_rig, (Finding("calibration-read", "info", None, text),))
 
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
@@ -107,13 +107,13 @@ def _poses(
     where: Path, cameras: Cameras, transform: Direction | None, height: ByCamera, yaw_deg: ByCamera
 ) -> tuple[dict[str, Array], str]:
     """ego_from_camera (4, 4) by camera, and how they were found."""
-    stated = {name: of.pose for name, of in cameras.items() if of.pose is not None}
-    lacking = [name for name in cameras if name not in stated]
-    if not stated and height is not None:
+    pose_of = {name: of.pose for name, of in cameras.items() if of.pose is not None}
+    lacking = [name for name in cameras if name not in pose_of]
+    if not pose_of and height is not None:
         starts = tuple(name for name, of in cameras.items() if of.from_previous is None) or tuple(cameras)
         guessed, how = _guessed_poses(starts, height, yaw_deg)
-        known = {name: StatedPose({"": pose}, "ego_from_camera", exact=True) for name, pose in guessed.items()}
-        linked = _along_chain({name: replace(of, pose=known.get(name)) for name, of in cameras.items()})
+        guessed_poses = {name: StatedPose({"": pose}, "ego_from_camera", exact=True) for name, pose in guessed.items()}
+        linked = _along_chain({name: replace(of, pose=guessed_poses.get(name)) for name, of in cameras.items()})
         return decide_poses(where, {name: of.pose for name, of in linked.items() if of.pose}, None)[0], how
     if lacking:
         why = "moves through the file, as in a reconstruction" if cameras[lacking[0]].moves else "is missing"
@@ -124,9 +124,9 @@ def _poses(
     if yaw_deg is not None:
         raise InputError(f"{where}: states the poses of the cameras: remove `yaw_deg` (`--yaw`)")
     heights = _by_camera(height, tuple(cameras), "height")
-    if transform is not None and all(pose.exact for pose in stated.values()):
+    if transform is not None and all(pose.exact for pose in pose_of.values()):
         raise InputError(f"{where}: states what its transforms mean: remove `transform` (`--transform`)")
-    poses, how = decide_poses(where, stated, transform, level_known=bool(heights))
+    poses, how = decide_poses(where, pose_of, transform, level_known=bool(heights))
     yaws = ", ".join(f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°" for name, pose in poses.items())
     if heights:
         poses, how = raised(poses, heights), f"{how}, raised to `height` (`--height`)"
@@ -152,24 +152,24 @@ def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, dri
 
 def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:
     """A single camera has the name of the only folder or video with images; of several, a video is one by its name."""
-    found = list(first_images(drive)) if drive is not None else []
-    if len(cameras) == len(found) == 1:
-        return {found[0]: next(iter(cameras.values()))}
-    if drive is None or not drive.is_file() or not found:
+    image_names = list(first_images(drive)) if drive is not None else []
+    if len(cameras) == len(image_names) == 1:
+        return {image_names[0]: next(iter(cameras.values()))}
+    if drive is None or not drive.is_file() or not image_names:
         return cameras
-    if found[0] not in cameras:
+    if image_names[0] not in cameras:
         raise InputError(f"{drive}: {SEVERAL.format(counted(len(cameras), 'cameras'), ', '.join(cameras))}")
-    return {found[0]: cameras[found[0]]}
+    return {image_names[0]: cameras[image_names[0]]}
 
 
 # Kinds of files
 
 
-def _stated(path: Path) -> tuple[str, Cameras]:
+def _read_cameras(path: Path) -> tuple[str, Cameras]:
     """What a calibration is, in words, and its cameras."""
-    for kind, (recognises, read) in KINDS.items():
+    for format_name, (recognises, read) in KINDS.items():
         if recognises(path):
-            return kind, read(path)
+            return format_name, read(path)
     if path.is_dir():
         raise InputError(
             f"{path}: has no calibration (expected calibration.json, a file a camera ({', '.join(SUFFIXES)}), "
@@ -187,42 +187,42 @@ def _extrinsics(path: Path) -> Cameras:
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
         )
-    return _stated(path)[1]
+    return _read_cameras(path)[1]
 
 
 def _bev_frame(path: Path) -> Array | None:
     """(4, 4) ego_from_bev of a file that states it."""
     document = read_document(path) if path.suffix.lower() in SUFFIXES and not path.is_dir() else None
-    stated = isinstance(document, dict) and "ego_from_bev" in document
-    return require(parse_transform, document, "ego_from_bev", where=path) if stated else None
+    is_stated = isinstance(document, dict) and "ego_from_bev" in document
+    return require(parse_transform, document, "ego_from_bev", where=path) if is_stated else None
 
 
 def _along_chain(cameras: Cameras) -> Cameras:
     """Poses of cameras without one by that of a neighbour in Kalibr's chain, in the file's order."""
-    found, pairs = dict(cameras), list(pairwise(cameras))
-    for known, other in [*pairs, *((name, earlier) for earlier, name in reversed(pairs))]:
-        is_next = (known, other) in pairs
-        link, pose = found[other if is_next else known].from_previous, found[known].pose
-        if found[other].pose is None and pose is not None and link is not None:
-            found[other] = replace(found[other], pose=pose.moved(inverse(link) if is_next else link))
-    return found
+    linked, pairs = dict(cameras), list(pairwise(cameras))
+    for neighbour, other in [*pairs, *((name, earlier) for earlier, name in reversed(pairs))]:
+        is_next = (neighbour, other) in pairs
+        link, pose = linked[other if is_next else neighbour].from_previous, linked[neighbour].pose
+        if linked[other].pose is None and pose is not None and link is not None:
+            linked[other] = replace(linked[other], pose=pose.moved(inverse(link) if is_next else link))
+    return linked
 
 
 # Without any file
 
 
 def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_deg: ByCamera) -> RigDraft:
-    found = list(first_images(drive)) if drive is not None else []
-    if not found:
+    names = list(first_images(drive)) if drive is not None else []
+    if not names:
         raise InputError(f"{drive}: has no images of a camera (expected images/CAMERA/*.jpg, or a video)")
     if height is None:
         raise InputError(
             "`fov_deg` (`--fov`) needs the height of the camera above the ground: pass `height=1.5` (`--height 1.5`)"
         )
-    fovs = _by_camera(fov_deg, tuple(found), "fov_deg")
-    poses, how = _guessed_poses(tuple(found), height, yaw_deg)
+    fovs = _by_camera(fov_deg, tuple(names), "fov_deg")
+    poses, how = _guessed_poses(tuple(names), height, yaw_deg)
     cameras = []
-    for name in found:
+    for name in names:
         size = size_of_first(drive, name)
         if size is None:
             raise InputError(f"{drive}: camera {name}: its first image cannot be read: bring it back")

@@ -20,22 +20,22 @@ LOOKED_AT = 50  # entries of a folder
 def words_of(name: str) -> frozenset[str]:
     """The words of a camera's name, without order, such as front and left for CAM_FRONT_LEFT, frontLeft and fl."""
     words = [word.lstrip("0") or "0" if word.isdigit() else word for word in WORD.findall(name.lower())]
-    return frozenset(part for word in words for part in SHORT.get(word, word).split()) - ANY
+    return frozenset(long_word for word in words for long_word in SHORT.get(word, word).split()) - ANY
 
 
-def match_names(cameras: Iterable[str], found: Iterable[str]) -> dict[str, str]:
-    """camera -> the found name that is equal or, if that is unambiguous, the same but for case or by its words.
+def match_names(cameras: Iterable[str], names: Iterable[str]) -> dict[str, str]:
+    """camera -> the one of `names` that is equal or, if that is unambiguous, the same but for case or by its words.
 
-    A camera without one is left out. A found name belongs to one camera at most.
+    A camera without one is left out. A name belongs to one camera at most.
     """
-    cameras, found = list(cameras), list(found)
+    cameras, names = list(cameras), list(names)
     matched: dict[str, str] = {}
     for key in (str, str.lower, words_of):
-        left = [name for name in cameras if name not in matched]
-        free = [name for name in found if name not in matched.values()]
-        for camera in left:
+        unmatched = [name for name in cameras if name not in matched]
+        free = [name for name in names if name not in matched.values()]
+        for camera in unmatched:
             fitting = [name for name in free if key(name) and key(name) == key(camera)]
-            if len(fitting) == 1 and sum(key(name) == key(camera) for name in left) == 1:
+            if len(fitting) == 1 and sum(key(name) == key(camera) for name in unmatched) == 1:
                 matched[camera] = fitting[0]
     return {camera: matched[camera] for camera in cameras if camera in matched}
 

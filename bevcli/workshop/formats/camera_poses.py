@@ -131,21 +131,21 @@ def decide_poses(
     rigs = {each: {name: pose.ego_from_camera(each) for name, pose in poses.items()} for each in _readings(free, asked)}
     reasons = {reading: _impossible(rig, level_known=level_known) for reading, rig in rigs.items()}
     possible = _distinct([reading for reading in rigs if not reasons[reading]], rigs)
-    stated = next((pose.direction for pose in free if pose.direction), None)
-    chosen = [reading for reading in possible if reading.direction == stated] or possible
-    _check_certain(f"{where}: {free[0].name}", chosen, reasons, stated)
+    named = next((pose.direction for pose in free if pose.direction), None)
+    fitting = [reading for reading in possible if reading.direction == named] or possible
+    _check_certain(f"{where}: {free[0].name}", fitting, reasons, named)
     why = "as stated" if asked or len(possible) > 1 else "the only reading with the cameras on a vehicle"
-    if stated and stated != chosen[0].direction and not asked:
-        why += f"; its name says {stated}"
-    return rigs[chosen[0]], f"{free[0].name} is {chosen[0].text} ({why})"
+    if named and named != fitting[0].direction and not asked:
+        why += f"; its name says {named}"
+    return rigs[fitting[0]], f"{free[0].name} is {fitting[0].text} ({why})"
 
 
 def _check_certain(
-    where: str, chosen: list[Reading], reasons: Mapping[Reading, tuple[str, str] | None], stated: Direction | None
+    where: str, chosen: list[Reading], reasons: Mapping[Reading, tuple[str, str] | None], named: Direction | None
 ) -> None:
     """Raise InputError unless one reading is chosen, and more than the sign of a height decides it.
 
-    reasons: why readings are impossible. stated: the direction that a name states.
+    reasons: why readings are impossible. named: the direction that a name states.
     """
     if not chosen:
         nearest = min(reasons, key=lambda reading: (reasons[reading] or ("",))[0] not in ADVICE)
@@ -167,7 +167,7 @@ def _check_certain(
             f"{where}: the order of the quaternions is not certain: name them rotation_wxyz or rotation_xyzw"
         )
     for other, reason in reasons.items():
-        if first != stated and other.direction != first and reason and reason[0] == "below":  # the origin of a lidar?
+        if first != named and other.direction != first and reason and reason[0] == "below":  # the origin of a lidar?
             raise InputError(
                 f"{where}: as {other.text}, {reason[1]}, and as {first} above it: pass "
                 f'`transform="{first}"` (`--transform {first}`); or `transform="{other.direction}"` (`--transform '
@@ -191,8 +191,8 @@ def _readings(free: Sequence[StatedPose], asked: Direction | None) -> Iterator[R
     """The ways to read transforms that are not exact. asked: the only direction."""
     orders = sorted({order for pose in free for order in pose.matrices})
     axes = next(((pose.axes,) for pose in free if pose.axes), ("optical", "vehicle"))
-    for direction, kind, order in product((asked,) if asked else DIRECTIONS, axes, orders):
-        yield Reading(direction, kind, order)
+    for direction, camera_axes, order in product((asked,) if asked else DIRECTIONS, axes, orders):
+        yield Reading(direction, camera_axes, order)
 
 
 def _distinct(readings: list[Reading], rigs: Mapping[Reading, Mapping[str, Array]]) -> list[Reading]:
@@ -243,5 +243,5 @@ def guessed_pose(height: float, yaw: float) -> Array:
     It lies where nuScenes' cameras are: 1.7 m ahead of the rear axle if it looks ahead, above the axle if it looks
     back, and 0.5 m to the side in between.
     """
-    place = (0.85 + 0.85 * np.cos(yaw), 0.5 * np.sin(yaw), height)
-    return rigid(place, rotation_about_z(yaw) @ AXES["vehicle"].T)
+    position = (0.85 + 0.85 * np.cos(yaw), 0.5 * np.sin(yaw), height)
+    return rigid(position, rotation_about_z(yaw) @ AXES["vehicle"].T)

@@ -62,8 +62,8 @@ def convert(source: str | Path, out: str | Path, **options: Any) -> Converted:
         InputError: see `open_sequence`; or not one image could be read.
         OutputError: something is there already, or it cannot be written.
     """
-    common, labels, written, own = spread(options, InputOptions, LabelOptions, WriteOptions)
-    drive = open_sequence(source, to_convert(Path(source), Path(out), common), **own)
+    common, labels, written, format_options = spread(options, InputOptions, LabelOptions, WriteOptions)
+    drive = open_sequence(source, to_convert(Path(source), Path(out), common), **format_options)
     converted: Converted = deque[Any](write_drive(with_labels(drive, labels), Path(out), written), maxlen=1).pop()
     return converted
 

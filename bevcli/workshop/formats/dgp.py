@@ -131,14 +131,14 @@ def _nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
     DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
     frame per second in place of ten. where: start of a message.
     """
-    found = [(time - EPOCH) // timedelta(microseconds=1) * 1000 for time in times]
-    tenfold = max(found) > LARGEST_INTEGER
-    found = [time // 10 for time in found] if tenfold else found
-    if not 0 <= min(found) <= max(found) <= LARGEST_INTEGER:
+    times_ns = [(time - EPOCH) // timedelta(microseconds=1) * 1000 for time in times]
+    tenfold = max(times_ns) > LARGEST_INTEGER
+    times_ns = [time // 10 for time in times_ns] if tenfold else times_ns
+    if not 0 <= min(times_ns) <= max(times_ns) <= LARGEST_INTEGER:
         raise InputError(
             f"{where}: the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)"
         )
-    return found, tenfold
+    return times_ns, tenfold
 
 
 @dataclass(frozen=True)
@@ -227,17 +227,17 @@ def _read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
     times, tenfold = _nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
     data = {key: _datum(record, time) for (key, record), time in zip(records.items(), times, strict=False)}
     calibration_of = cache(lambda key: _read_calibration(path / "calibration" / f"{key}.json"))
-    found = []
+    samples_with_data = []
     for sample, time in zip(samples, times[len(records) :], strict=True):
         calibration = calibration_of(sample.text("calibration_key"))
-        found.append(Sample(time, _data_of(sample, data, calibration), calibration))
-    if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(found)):
+        samples_with_data.append(Sample(time, _data_of(sample, data, calibration), calibration))
+    if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(samples_with_data)):
         raise InputError(f"{scene.where}: two samples have the same time (expected increasing times)")
-    return tuple(found), tenfold
+    return tuple(samples_with_data), tenfold
 
 
 def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibration) -> tuple[Datum, ...]:
-    found = []
+    data_of_sample = []
     for key in sample.texts("datum_keys"):
         if key not in data:
             raise InputError(f'{sample.where}: datum "{key:.40}" is missing in "data"')
@@ -246,20 +246,20 @@ def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibra
             continue
         if datum.sensor not in calibration.ego_from:
             raise InputError(f'{sample.where}: its calibration has no sensor "{datum.sensor}"')
-        found.append(datum)
-    if not found:
+        data_of_sample.append(datum)
+    if not data_of_sample:
         raise InputError(f"{sample.where}: has no image and no point cloud (expected at least one)")
-    return tuple(found)
+    return tuple(data_of_sample)
 
 
 def _datum(record: Record, time_ns: int) -> Datum | None:
     contents = record.record("datum")
-    kind = next((name for name in ("image", "point_cloud") if name in contents.value), None)
-    if kind is None:
+    datum_type = next((name for name in ("image", "point_cloud") if name in contents.value), None)
+    if datum_type is None:
         return None
-    content = contents.record(kind)
+    content = contents.record(datum_type)
     pose = content.record("pose").pose()
-    return Datum(record.record("id").text("name"), kind == "image", content, time_ns, pose)
+    return Datum(record.record("id").text("name"), datum_type == "image", content, time_ns, pose)
 
 
 def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
@@ -273,7 +273,7 @@ def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
     return times, np.stack([pose.translation for _, pose in rows]), np.stack([pose.quaternion for _, pose in rows])
 
 
-def open_scene(path: Path, common: InputOptions, own: Format) -> ListedDrive:
+def open_scene(path: Path, common: InputOptions, options: Format) -> ListedDrive:
     """The samples of a DGP scene. Point clouds are not read, only the boxes that are annotated in them.
 
     The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.
@@ -335,8 +335,8 @@ def _scene_file(path: Path) -> Path:
     files = sorted(path.glob("scene_*.json"))
     if len(files) == 1:
         return files[0]
-    found = ", ".join(file.name for file in files[:4]) or "none"
-    raise InputError(f"{path}: expected one file scene_*.json, found {found}")
+    names = ", ".join(file.name for file in files[:4]) or "none"
+    raise InputError(f"{path}: expected one file scene_*.json, found {names}")
 
 
 def _read_ontology(folder: Path, scene: Record, class_map: Mapping[str, str]) -> dict[int, str]:

@@ -64,16 +64,16 @@ def export(predictions: str | Path, options: ExportOptions | None = None, **chan
     return target, what
 
 
-def export_boxes(predictions: Path, chosen: ExportOptions) -> tuple[Path, str, str]:
+def export_boxes(predictions: Path, options: ExportOptions) -> tuple[Path, str, str]:
     """Write boxes, see `export`: the file, what was written, and a note where a recording is incomplete, or ""."""
-    if chosen.form not in BOX_FORMATS:
-        raise InputError(f"`form={chosen.form}` (`--format`): unknown format (expected {', '.join(BOX_FORMATS)})")
-    form = BOX_FORMATS[chosen.form]
+    if options.form not in BOX_FORMATS:
+        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(BOX_FORMATS)})")
+    form = BOX_FORMATS[options.form]
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
-    target = chosen.out or file.parent / form.target
+    target = options.out or file.parent / form.target
     check_output(target, file)
     boxes, note = _boxes_of(file)
-    return target, form.write(above_score(boxes, chosen.score), target, chosen, file), note
+    return target, form.write(above_score(boxes, options.score), target, options, file), note
 
 
 def _boxes_of(file: Path) -> tuple[BoxesFile, str]:

@@ -37,7 +37,7 @@ def first_images(drive: Path) -> dict[str, Path]:
 
 def _listed(table: Path) -> dict[str, Path]:
     """The first cell of each camera's column in frames.csv. Nothing of a broken table, which its own reader refuses."""
-    found, cameras = dict[str, Path](), list[str]()
+    first_files, cameras = dict[str, Path](), list[str]()
     with suppress(csv.Error):
         rows = csv.reader(io.StringIO(read_text(table, CSV_BYTES).removeprefix("\ufeff"), newline=""))
         names = [name_of(cell.strip()) for cell in next(rows, [])]
@@ -45,10 +45,10 @@ def _listed(table: Path) -> dict[str, Path]:
         for row in rows:
             cells = dict(zip(names, row, strict=False))
             first = {name: name_of(cells[name].strip()) for name in cameras if cells.get(name)}
-            found = {name: table.parent / cell.partition("#")[0] for name, cell in first.items()} | found
-            if len(found) == len(cameras):
+            first_files = {name: table.parent / cell.partition("#")[0] for name, cell in first.items()} | first_files
+            if len(first_files) == len(cameras):
                 break
-    return {name: found[name] for name in cameras if name in found}
+    return {name: first_files[name] for name in cameras if name in first_files}
 
 
 def _first_in(folder: Path) -> Path | None:

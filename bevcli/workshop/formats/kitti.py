@@ -173,8 +173,8 @@ def kitti_labels(
 
 def _kitti_type(name: str, classes: Mapping[str, ObjectClass]) -> str:
     """A class's type in KITTI's files, whose columns are parted by spaces; "Misc" for a class that is not known."""
-    known = classes.get(name)
-    return "Misc" if known is None else "_".join((known.kitti or known.name).split())
+    object_class = classes.get(name)
+    return "Misc" if object_class is None else "_".join((object_class.kitti or object_class.name).split())
 
 
 def _image_box(corners: Array, camera: Camera) -> tuple[Array, float] | None:

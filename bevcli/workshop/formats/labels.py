@@ -184,7 +184,7 @@ def with_track_velocities(frames: Sequence[Boxes3D], timestamps_ns: Sequence[int
     first[order[1:][same]], last[order[:-1][same]] = order[:-1][same], order[1:][same]
     velocities = velocities_between(together.centers, seconds, first, last)[:, :2]
     parts = np.split(velocities, np.cumsum(counts)[:-1])
-    return [replace(boxes, velocities=own) for boxes, own in zip(frames, parts, strict=True)]
+    return [replace(boxes, velocities=of_frame) for boxes, of_frame in zip(frames, parts, strict=True)]
 
 
 LARGEST_BYTES = 512 * MIB
@@ -243,8 +243,8 @@ def _rows(path: Path, text: str, separator: str) -> tuple[list[str], list[CsvRow
     for line, cells in lines:
         if len(cells) > len(columns):
             raise InputError(f"{path}: line {line}: has more cells than the {len(columns)} columns of the first line")
-        stated = zip_longest(columns, map(str.strip, cells), fillvalue="")
-        rows.append(CsvRow(path, line, {**dict.fromkeys(OPTIONAL, ""), **dict(stated)}))
+        pairs = zip_longest(columns, map(str.strip, cells), fillvalue="")
+        rows.append(CsvRow(path, line, {**dict.fromkeys(OPTIONAL, ""), **dict(pairs)}))
     return columns, rows
 
 
@@ -301,8 +301,8 @@ def _names(rows: list[CsvRow], column: str) -> Any:
 
 
 def _frame_of_reference(path: Path, rows: list[CsvRow]) -> Any:
-    stated = {row.cells["frame_of_reference"] or "ego" for row in rows} or {"ego"}
-    if len(stated) > 1 or not stated <= {"world", "ego", "bev"}:
-        found = ", ".join(sorted(stated))
-        raise InputError(f"{path}: column frame_of_reference: expected world, ego or bev in all rows, found {found}")
-    return stated.pop()
+    references = {row.cells["frame_of_reference"] or "ego" for row in rows} or {"ego"}
+    if len(references) > 1 or not references <= {"world", "ego", "bev"}:
+        names = ", ".join(sorted(references))
+        raise InputError(f"{path}: column frame_of_reference: expected world, ego or bev in all rows, found {names}")
+    return references.pop()

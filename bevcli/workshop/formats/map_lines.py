@@ -206,17 +206,17 @@ def lines_in_area(shapes: Iterable[tuple[str, BaseGeometry]]) -> MapLines:
     shapes: class, and lines or boundaries of polygons in the bev frame, metres. A closed line that the area cuts is
     open. Lines shorter than SHORTEST_M are left out.
     """
-    lines = [(name, part) for name, shape in shapes for part in _parts(shape.intersection(AREA))]
-    points = tuple(np.array(part.coords, dtype=np.float64) for _, part in lines)
+    lines = [(name, line) for name, shape in shapes for line in _parts(shape.intersection(AREA))]
+    points = tuple(np.array(line.coords, dtype=np.float64) for _, line in lines)
     return MapLines(points, np.array([name for name, _ in lines], dtype=np.str_))
 
 
 def _parts(shape: BaseGeometry) -> Iterator[LineString]:
     """The connected lines of a shape."""
     merged = linemerge(shape) if shape.geom_type == "MultiLineString" else shape
-    for part in getattr(merged, "geoms", [merged]):
-        if part.geom_type in ("LineString", "LinearRing") and part.length >= SHORTEST_M:
-            yield part
+    for line in getattr(merged, "geoms", [merged]):
+        if line.geom_type in ("LineString", "LinearRing") and line.length >= SHORTEST_M:
+            yield line
 
 
 class MapExpansion:

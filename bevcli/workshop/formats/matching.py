@@ -34,8 +34,8 @@ class CameraImages:
 
     def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""
-        chosen = nearest(self.times_ns, times_ns)
-        return chosen, np.abs(self.times_ns[chosen] - times_ns) <= FARTHEST * self.period_ns
+        indices = nearest(self.times_ns, times_ns)
+        return indices, np.abs(self.times_ns[indices] - times_ns) <= FARTHEST * self.period_ns
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ class Matched:
 
 def measured_periods(times: Mapping[str, NDArray[np.int64]]) -> dict[str, float]:
     """The period of each camera, ns: the median of its steps, and that of all cameras where these are about equal."""
-    steps = {camera: np.diff(np.sort(each)) for camera, each in times.items() if len(each) > 1}
+    steps = {camera: np.diff(np.sort(stamps)) for camera, stamps in times.items() if len(stamps) > 1}
     if not steps:
         return dict.fromkeys(times, 1e9)
     common = float(np.median(np.concatenate(list(steps.values()))))
-    own = {camera: float(np.median(steps[camera])) if camera in steps else common for camera in times}
-    return {camera: common if abs(each / common - 1) < SAME_RATE else each for camera, each in own.items()}
+    periods = {camera: float(np.median(steps[camera])) if camera in steps else common for camera in times}
+    return {camera: common if abs(period / common - 1) < SAME_RATE else period for camera, period in periods.items()}
 
 
 def match(cameras: Mapping[str, CameraImages]) -> Matched:
@@ -75,8 +75,8 @@ def match(cameras: Mapping[str, CameraImages]) -> Matched:
     nearest = {camera: images.nearest(times) for camera, images in cameras.items()}
     entries: list[FrameEntry] = []
     farthest = missing = 0
-    for place, time in enumerate(times.tolist()):
-        there = {camera: int(chosen[place]) for camera, (chosen, is_near) in nearest.items() if is_near[place]}
+    for row, time in enumerate(times.tolist()):
+        there = {camera: int(indices[row]) for camera, (indices, is_near) in nearest.items() if is_near[row]}
         if not there:
             continue
         sources = {camera: cameras[camera].image(index) for camera, index in there.items()}

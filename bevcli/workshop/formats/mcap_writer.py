@@ -67,21 +67,21 @@ class Messages:
             text = "\n".join(_long(field) for field in fields.split(", "))
             self._store.register(get_types_from_msg(text, f"foxglove_msgs/msg/{name}"))
 
-    def definition(self, kind: str) -> str:
+    def definition(self, type_name: str) -> str:
         """The definition of a type, with those of all types that it contains."""
-        return str(self._store.generate_msgdef(_full(kind), ros_version=2)[0])
+        return str(self._store.generate_msgdef(_full(type_name), ros_version=2)[0])
 
-    def encode(self, kind: str, fields: dict[str, Any]) -> bytes:
+    def encode(self, type_name: str, fields: dict[str, Any]) -> bytes:
         """The CDR bytes of a message. Fields that are left out are zero or empty."""
-        return bytes(self._store.serialize_cdr(self._message(_full(kind), fields), _full(kind)))
+        return bytes(self._store.serialize_cdr(self._message(_full(type_name), fields), _full(type_name)))
 
     def _message(self, name: str, fields: dict[str, Any]) -> Any:
         kinds = dict(self._store.fielddefs[name][1])
         assert fields.keys() <= kinds.keys(), (name, fields.keys())
-        return self._store.types[name](**{key: self._value(kind, fields.get(key)) for key, kind in kinds.items()})
+        return self._store.types[name](**{key: self._value(entry, fields.get(key)) for key, entry in kinds.items()})
 
-    def _value(self, kind: Any, value: Any) -> Any:
-        node, detail = int(kind[0]), kind[1]
+    def _value(self, field_type: Any, value: Any) -> Any:
+        node, detail = int(field_type[0]), field_type[1]
         if node == NAME:
             return self._message(detail, value or {})
         if node not in (ARRAY, SEQUENCE):
@@ -96,13 +96,13 @@ class Messages:
 
 
 def _long(field: str) -> str:
-    kind, _, name = field.partition(" ")
-    plain = kind.removesuffix("[]")
-    return f"{SHORT.get(plain, plain)}{kind[len(plain) :]} {name}"
+    type_name, _, name = field.partition(" ")
+    plain = type_name.removesuffix("[]")
+    return f"{SHORT.get(plain, plain)}{type_name[len(plain) :]} {name}"
 
 
-def _full(kind: str) -> str:
-    return kind.replace("/", "/msg/")
+def _full(type_name: str) -> str:
+    return type_name.replace("/", "/msg/")
 
 
 class McapWriter:
@@ -121,8 +121,8 @@ class McapWriter:
             )
         self.path, self._has_ego_motion = path, sequence.has_ego_motion
         self._boxes = None if options.boxes is None else _boxes_of(options.boxes, options.score, sequence, path)
-        known = None if self._boxes is None else self._boxes.classes
-        self._colors = class_colors((known or NUSCENES_CLASSES).values())
+        classes = None if self._boxes is None else self._boxes.classes
+        self._colors = class_colors((classes or NUSCENES_CLASSES).values())
         frames = () if self._boxes is None else self._boxes.frames
         self._frames = {frame.stamp: frame for frame in frames}
         self._rig: CameraRig | None = None
@@ -137,9 +137,9 @@ class McapWriter:
         self._writer.start(profile="ros2", library="bevcli")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
-        if kind is not None:
-            self._open.__exit__(kind, *error)
+    def __exit__(self, error_type: type[BaseException] | None, *error: Any) -> None:
+        if error_type is not None:
+            self._open.__exit__(error_type, *error)
             return
         with self._open:
             if self._rig is None:
@@ -196,13 +196,13 @@ class McapWriter:
         in_ego = self._boxes.in_ego(predicted)
         return in_ego.transformed(frame.world_from_ego.matrix) if self._has_ego_motion else in_ego
 
-    def _add(self, topic: str, kind: str, time_ns: int, fields: Fields) -> None:
-        if kind not in self._schemas:
-            text = self._messages.definition(kind).encode()
-            self._schemas[kind] = self._writer.register_schema(kind.replace("/", "/msg/"), "ros2msg", text)
+    def _add(self, topic: str, type_name: str, time_ns: int, fields: Fields) -> None:
+        if type_name not in self._schemas:
+            text = self._messages.definition(type_name).encode()
+            self._schemas[type_name] = self._writer.register_schema(type_name.replace("/", "/msg/"), "ros2msg", text)
         if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
-        data = self._messages.encode(kind, fields)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
+        data = self._messages.encode(type_name, fields)
         self._writer.add_message(self._channels[topic], log_time=time_ns, publish_time=time_ns, data=data)
 
 
@@ -283,8 +283,8 @@ def _entity(time_ns: int, frame: str, boxes: Boxes3D, index: int, colors: Mappin
     center, size, yaw = boxes.centers[index], boxes.sizes_lwh[index], float(boxes.yaws[index])
     turned = _wxyz([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     velocity = boxes.velocities[index]
-    facts = {"class": name, "track": identity, "score": "" if score is None else f"{score:.4f}"}
-    facts |= {"vx": f"{velocity[0]:.3f}", "vy": f"{velocity[1]:.3f}"} if np.isfinite(velocity).all() else {}
+    properties = {"class": name, "track": identity, "score": "" if score is None else f"{score:.4f}"}
+    properties |= {"vx": f"{velocity[0]:.3f}", "vy": f"{velocity[1]:.3f}"} if np.isfinite(velocity).all() else {}
     label = {
         "pose": {"position": _xyz(center + (0, 0, size[2] / 2 + FONT_M)), "orientation": _wxyz([1, 0, 0, 0])},
         "billboard": True,
@@ -296,7 +296,7 @@ def _entity(time_ns: int, frame: str, boxes: Boxes3D, index: int, colors: Mappin
         "timestamp": stamp(time_ns),
         "frame_id": frame,
         "id": str(index),  # identities may repeat: duplicates have those of their object
-        "metadata": [{"key": key, "value": value} for key, value in facts.items() if value],
+        "metadata": [{"key": key, "value": value} for key, value in properties.items() if value],
         "cubes": [{"pose": {"position": _xyz(center), "orientation": turned}, "size": _xyz(size), "color": color}],
         "texts": [label],
     }

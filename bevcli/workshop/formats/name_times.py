@@ -87,7 +87,7 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
     """
     columns = list(_columns(where, names))
     if kind is not None:
-        return _stated(where, columns, names, kind)
+        return _in_unit(where, columns, names, kind)
     dates = _dates(names)
     if dates is not None and (_has_rate(dates.values) or not _steps(dates.values)):
         return _in_time_zone(dates, motion)
@@ -133,64 +133,64 @@ def _columns(where: Path, names: Texts) -> Iterator[Texts]:
         if any(len(of_camera) > 1 for of_camera in counts.values()):
             continue
         columns = []
-        for place in range(-1, -1 - min(chain.from_iterable(counts.values())), -1):
-            column = {camera: [numbers[place] for numbers in of_camera] for camera, of_camera in split.items()}
+        for position in range(-1, -1 - min(chain.from_iterable(counts.values())), -1):
+            column = {camera: [numbers[position] for numbers in of_camera] for camera, of_camera in split.items()}
             if pattern is NUMBER or any("." in text for text in chain.from_iterable(column.values())):
                 columns.append(column)
         varying = [column for column in columns if any(len(set(texts)) > 1 for texts in column.values())]
         yield from varying or (columns[:1] if pattern is NUMBER else ())
         if pattern is DECIMAL:
-            found = {camera: [SECONDS_AND_FRACTION.search(name) for name in each] for camera, each in names.items()}
-            if all(chain.from_iterable(found.values())):
-                yield {camera: [f"{m[1]}.{m[2]}" for m in each if m] for camera, each in found.items()}
+            matches = {camera: [SECONDS_AND_FRACTION.search(name) for name in each] for camera, each in names.items()}
+            if all(chain.from_iterable(matches.values())):
+                yield {camera: [f"{m[1]}.{m[2]}" for m in each if m] for camera, each in matches.items()}
 
 
 def _check_counts(where: Path, names: Texts, split: Mapping[str, list[list[str]]]) -> None:
     for camera, numbers in split.items():
-        for name, found in zip(names[camera], numbers, strict=True):
-            if len(found) != len(numbers[0]):
+        for name, in_name in zip(names[camera], numbers, strict=True):
+            if len(in_name) != len(numbers[0]):
                 raise InputError(
-                    f"{where}: camera {camera}: the name {name} has {len(found)} numbers, and {names[camera][0]} has "
+                    f"{where}: camera {camera}: the name {name} has {len(in_name)} numbers, and {names[camera][0]} has "
                     f"{len(numbers[0])}: rename one, or list the images in frames.csv"
                 )
 
 
 def _readings(column: Texts) -> list[Reading]:
     """The possible readings of a column. One that is a time since 1970 at the rate of a camera is the only one."""
-    found, slow = list[Reading](), list[Reading]()
-    for kind in UNITS_NS:
-        reading = _read(column, kind)
+    readings, slow = list[Reading](), list[Reading]()
+    for unit in UNITS_NS:
+        reading = _read(column, unit)
         if reading is None:
             continue
         steps = _steps(reading.values)
         if reading.is_known_origin and (_has_rate(reading.values) or not steps):
             return [reading]
-        if reading.is_known_origin and all(np.median(each) >= PERIODS_NS[0] for each in steps):
-            is_usual = all(np.median(each) <= LONGEST_PERIOD_NS for each in steps)
-            (found if is_usual else slow).append(reading)  # the slow ones if no other unit fits
+        if reading.is_known_origin and all(np.median(camera_steps) >= PERIODS_NS[0] for camera_steps in steps):
+            is_usual = all(np.median(camera_steps) <= LONGEST_PERIOD_NS for camera_steps in steps)
+            (readings if is_usual else slow).append(reading)  # the slow ones if no other unit fits
         elif _has_rate(reading.values) and _is_steady(steps) and _extent(reading.values) <= LONGEST_NS:
-            found.append(reading)
-    found = found or slow
+            readings.append(reading)
+    readings = readings or slow
     index = _read(column, "index")
     if index is None:
-        return found
+        return readings
     steps = _steps(index.values)
     if not steps:  # each camera has one image
         is_time = _largest(index) >= SMALLEST_TIMESTAMP
         return [reading] if is_time and (reading := _read(column, "ns")) else [index]
     if _largest(index) >= LARGEST_INDEX:
-        return found
+        return readings
     pooled = np.concatenate(steps)
     step = np.median(pooled)
-    if step < DENSE_STEP or (not found and step <= SPARSE_STEP):
+    if step < DENSE_STEP or (not readings and step <= SPARSE_STEP):
         return [index]
     is_regular = (pooled % step == 0).mean() >= STEADY and step <= LARGEST_STEP
-    return [*found, index] if is_regular else found
+    return [*readings, index] if is_regular else readings
 
 
-def _read(column: Texts, kind: TimeKind) -> Reading | None:
+def _read(column: Texts, unit: TimeKind) -> Reading | None:
     """A column in a unit; None where two images of a camera have the same number, or one is too large or a decimal."""
-    factor = UNITS_NS.get(kind)
+    factor = UNITS_NS.get(unit)
     values = {}
     for camera, texts in column.items():
         if factor is None and any("." in text for text in texts):
@@ -201,7 +201,7 @@ def _read(column: Texts, kind: TimeKind) -> Reading | None:
         values[camera] = np.array(numbers, dtype=np.int64)
     first, last = SINCE_1970_NS
     is_known = factor is not None and all(((v >= first) & (v < last)).all() for v in values.values())
-    return Reading(kind, values, " since 1970" if is_known else "")
+    return Reading(unit, values, " since 1970" if is_known else "")
 
 
 def _scaled(text: str, factor: int) -> int:
@@ -223,14 +223,14 @@ def _dates(names: Texts) -> Reading | None:
 
 
 def _date_ns(name: str) -> int | None:
-    found = DATE.search(name)
-    if found is None:
+    date = DATE.search(name)
+    if date is None:
         return None
     try:
-        time = datetime(*map(int, found.groups()[:6]), tzinfo=UTC)  # type: ignore[arg-type,misc]
+        time = datetime(*map(int, date.groups()[:6]), tzinfo=UTC)  # type: ignore[arg-type,misc]
     except ValueError:
         return None
-    return int(time.timestamp()) * 10**9 + int((found[7] or found[8] or "").ljust(9, "0"))
+    return int(time.timestamp()) * 10**9 + int((date[7] or date[8] or "").ljust(9, "0"))
 
 
 def _in_time_zone(dates: Reading, motion: EgoMotion | None) -> Reading:
@@ -245,7 +245,7 @@ def _in_time_zone(dates: Reading, motion: EgoMotion | None) -> Reading:
     return fitting[0] if len(fitting) == 1 else dates
 
 
-def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
+def _in_unit(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
     """The reading of the kind that the user states, of the column that fits best."""
     made = [_dates(names)] if kind == "date" else [_read(column, kind) for column in columns]
     possible = [reading for reading in made if reading is not None]
@@ -264,20 +264,20 @@ def _stated(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> 
 
 def _steps(values: Mapping[str, Times]) -> list[Times]:
     """Of each camera with two or more images, the steps from one to the next."""
-    ordered = [np.sort(each) for each in values.values() if len(each) > 1]
-    return [each[1:] - each[:-1] for each in ordered]
+    ordered = [np.sort(times) for times in values.values() if len(times) > 1]
+    return [times[1:] - times[:-1] for times in ordered]
 
 
 def _has_rate(values: Mapping[str, Times]) -> bool:
     shortest, longest = PERIODS_NS
     steps = _steps(values)
-    return bool(steps) and all(shortest <= np.median(each) <= longest for each in steps)
+    return bool(steps) and all(shortest <= np.median(camera_steps) <= longest for camera_steps in steps)
 
 
 def _is_steady(steps: list[Times]) -> bool:
     """True where most steps are whole periods of the camera, more than one where an image was lost."""
-    for each in steps:
-        periods = each / np.median(each)
+    for camera_steps in steps:
+        periods = camera_steps / np.median(camera_steps)
         whole = np.maximum(np.round(periods), 1)
         if (np.abs(periods - whole) <= JITTER).mean() < STEADY:
             return False
@@ -285,8 +285,8 @@ def _is_steady(steps: list[Times]) -> bool:
 
 
 def _extent(values: Mapping[str, Times]) -> int:
-    return int(max(each.max() for each in values.values()) - min(each.min() for each in values.values()))
+    return int(max(times.max() for times in values.values()) - min(times.min() for times in values.values()))
 
 
 def _largest(reading: Reading) -> int:
-    return int(max(each.max() for each in reading.values.values()))
+    return int(max(times.max() for times in reading.values.values()))

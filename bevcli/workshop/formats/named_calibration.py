@@ -59,8 +59,8 @@ def read_named(path: Path) -> Cameras:
             if other is not of and (of.intrinsics is None) == (other.intrinsics is None):
                 raise InputError(f"{file}: camera {name} is in another file too: keep one")
             if other is not of:  # intrinsics in one file, and poses in another
-                known, posed = (of, other) if other.intrinsics is None else (other, of)
-                of = replace(known, pose=posed.pose or known.pose)
+                with_intrinsics, with_pose = (of, other) if other.intrinsics is None else (other, of)
+                of = replace(with_intrinsics, pose=with_pose.pose or with_intrinsics.pose)
             cameras[name] = of
     return cameras
 
@@ -108,9 +108,9 @@ def _named_cameras(document: Any, path: Path) -> Cameras:
     document = {re.sub(r"\ACamera\d*\.", "", str(key)): value for key, value in document.items()}  # ORB-SLAM's names
     entries = document.get("cameras", document.get("sensors"))
     if isinstance(entries, list):
-        names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{place}")
-                 if isinstance(entry, dict) else "" for place, entry in enumerate(entries)]  # fmt: skip
-        for name in (name for place, name in enumerate(names) if name in names[:place]):
+        names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")
+                 if isinstance(entry, dict) else "" for index, entry in enumerate(entries)]  # fmt: skip
+        for name in (name for index, name in enumerate(names) if name in names[:index]):
             raise InputError(f"{path}: camera {name} is in the list twice: keep one")
         entries = dict(zip(names, entries, strict=True))
     if not isinstance(entries, dict) and _is_camera(document):
@@ -150,18 +150,18 @@ def _named_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
         raise InputError(f"{where}: camera_model {model:.60} is not supported (expected pinhole)")
     intrinsics = _value(entry, *INTRINSICS)
     inside = intrinsics if isinstance(intrinsics, dict) else {}  # K, D and the size may be one level deeper
-    stated = {**entry, **inside}
-    size = _value(stated, *SIZE)
-    sides = (_value(stated, *WIDTH), _value(stated, *HEIGHT))
+    fields = {**entry, **inside}
+    size = _value(fields, *SIZE)
+    sides = (_value(fields, *WIDTH), _value(fields, *HEIGHT))
     if isinstance(size, dict):
         sides = (_value(size, *WIDTH), _value(size, *HEIGHT))
     elif size is not None:
         sides = tuple(require(parse_numbers, {"resolution": size}, "resolution", (2,), where=where).tolist())
     chain = entry.get("T_cn_cnm1")
     return StatedCamera(
-        _camera_matrix(intrinsics, stated, where),
+        _camera_matrix(intrinsics, fields, where),
         sides if None not in sides else None,
-        lens_of(stated, model, where),
+        lens_of(fields, model, where),
         _pose(entry, where),
         from_previous=None if chain is None else require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where),
     )
@@ -195,9 +195,9 @@ def lens_of(entry: Mapping[str, Any], camera_model: str, where: str) -> Fields:
     fisheye = LENS_NAMES.get(_lens_name(model or camera_model)) == "kannala_brandt"
     if value is None or isinstance(value, dict):
         names = COEFFICIENTS["kannala_brandt" if fisheye else "brown_conrady"]
-        stated = [_value(value or entry, name) for name in names]
-        count = max((place for place, number in enumerate(stated, 1) if number is not None), default=0)
-        value = [number or 0 for number in stated][: next((each for each in (0, 4, 5) if count <= each), 8)]
+        numbers = [_value(value or entry, name) for name in names]
+        count = max((position for position, number in enumerate(numbers, 1) if number is not None), default=0)
+        value = [number or 0 for number in numbers][: next((length for length in (0, 4, 5) if count <= length), 8)]
     if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
         value = [number for row in value for number in row]  # a column or a row of a matrix
     fallback = camera_model if camera_model in LENS_NAMES else "plumb_bob"
@@ -236,14 +236,14 @@ def _pose(entry: Mapping[str, Any], where: str) -> StatedPose | None:
             raise InputError(f"{where}: {key}: {NO_TRANSFORM}")
     if matrices := _matrices(dict(entry)):
         return StatedPose(matrices, name="rotation and translation")
-    found = next(((str(key), value) for key, value in entry.items() if _plain(key) in TRANSFORM), None)
-    if found is None or found[1] is None:
+    named_value = next(((str(key), value) for key, value in entry.items() if _plain(key) in TRANSFORM), None)
+    if named_value is None or named_value[1] is None:
         return None
-    if matrices := _matrices(found[1]):
-        return StatedPose(matrices, name=found[0])
-    inner = _pose(found[1], where) if isinstance(found[1], dict) else None
+    if matrices := _matrices(named_value[1]):
+        return StatedPose(matrices, name=named_value[0])
+    inner = _pose(named_value[1], where) if isinstance(named_value[1], dict) else None
     if inner is None:
-        raise InputError(f"{where}: {found[0]}: {NO_TRANSFORM}")
+        raise InputError(f"{where}: {named_value[0]}: {NO_TRANSFORM}")
     return inner
 
 
@@ -251,15 +251,15 @@ def _direction_of(key: str) -> Direction | None:
     """The direction that a name states, such as T_cam_ego, cam2ego, camera_to_vehicle; None for another name."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower()
     words = re.sub("base_link|vehicle_frame", "base", words).replace("2", "_to_")
-    found = re.fullmatch(
+    match = re.fullmatch(
         rf"(?:t_|tf_)?({CAMERA_FRAMES}|{EGO_FRAMES})_(?:(from|to|t)_)?({CAMERA_FRAMES}|{EGO_FRAMES})", words
     )
     if key in ("T_BS", "T_bs"):
         return "ego_from_camera"  # EuRoC: body and sensor
-    if found is None or bool(re.fullmatch(CAMERA_FRAMES, found[1])) == bool(re.fullmatch(CAMERA_FRAMES, found[3])):
+    if match is None or bool(re.fullmatch(CAMERA_FRAMES, match[1])) == bool(re.fullmatch(CAMERA_FRAMES, match[3])):
         return None
-    from_first = bool(re.fullmatch(CAMERA_FRAMES, found[1]))
-    return "ego_from_camera" if from_first == (found[2] == "to") else "camera_from_ego"
+    from_first = bool(re.fullmatch(CAMERA_FRAMES, match[1]))
+    return "ego_from_camera" if from_first == (match[2] == "to") else "camera_from_ego"
 
 
 def _matrices(value: Any) -> dict[str, Array]:
@@ -267,15 +267,15 @@ def _matrices(value: Any) -> dict[str, Array]:
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     if isinstance(value, dict):
-        plain = {_plain(key): each for key, each in value.items()}
+        plain = {_plain(key): item for key, item in value.items()}
         rotation = next(((name, plain[name]) for name in ROTATION if plain.get(name) is not None), None)
         # Under "T" and "t", a translation has three numbers.
         translation = next(
-            (each for name in TRANSLATION if (each := _numbers(plain.get(name))) is not None and each.size == 3), None
+            (item for name in TRANSLATION if (item := _numbers(plain.get(name))) is not None and item.size == 3), None
         )
         if rotation is None or translation is None:
             return {}
-        return {order: rigid(translation.ravel(), each) for order, each in _rotations(*rotation).items()}
+        return {order: rigid(translation.ravel(), item) for order, item in _rotations(*rotation).items()}
     array = _numbers(value)
     if array is None or array.size not in (12, 16):
         return {}
@@ -304,5 +304,5 @@ def _rotations(name: str, value: Any) -> dict[str, Array]:
     if array.size != 4 or abs(np.linalg.norm(array) - 1) > 0.01:
         return {}
     orders = {"wxyz": array.ravel(), "xyzw": np.roll(array.ravel(), 1)}
-    known = {order for order in orders if name.endswith(order)} or ({"wxyz"} if name == "qvec" else set(orders))
-    return {order if len(known) > 1 else "": rotation_from_quaternion(orders[order]) for order in sorted(known)}
+    possible = {order for order in orders if name.endswith(order)} or ({"wxyz"} if name == "qvec" else set(orders))
+    return {order if len(possible) > 1 else "": rotation_from_quaternion(orders[order]) for order in sorted(possible)}

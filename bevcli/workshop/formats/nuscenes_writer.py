@@ -119,7 +119,7 @@ class NewTables:
         """log: name of the drive."""
         self.rows: dict[str, list[Row]] = {name: [] for name in TABLES}
         self._log = log
-        self._known: set[str] = set()  # tokens of rows that several frames share
+        self._shared: set[str] = set()  # tokens of rows that several frames share
         self._rigs: dict[str, CameraRig] = {}  # by scene
         self._samples: dict[str, list[Row]] = {}  # by scene
         self._streams: dict[tuple[str, str], list[Row]] = {}  # sample_data by scene and channel
@@ -142,12 +142,12 @@ class NewTables:
     def add_data(self, scene: str, sample: str, file: str, time_us: int, pose: Pose, camera: Camera | None) -> None:
         """Add a file of a sample, taken with the vehicle at a pose. camera: None for LIDAR_TOP."""
         channel = LIDAR if camera is None else camera.name
-        own = token("data", sample, channel)
-        self.rows["ego_pose"].append({"token": own, "timestamp": time_us, **_pose_of(pose)})
+        data_token = token("data", sample, channel)
+        self.rows["ego_pose"].append({"token": data_token, "timestamp": time_us, **_pose_of(pose)})
         row = {
-            "token": own,
+            "token": data_token,
             "sample_token": sample,
-            "ego_pose_token": own,
+            "ego_pose_token": data_token,
             "calibrated_sensor_token": token("calibrated", scene, channel),
             "timestamp": time_us,
             "fileformat": "pcd" if camera is None else file.rpartition(".")[2],
@@ -207,8 +207,8 @@ class NewTables:
         ]
         for channel, modality, ego_from_sensor, intrinsics in sensors:
             sensor = self._share("sensor", token("sensor", channel), channel=channel, modality=modality)
-            own, pose = token("calibrated", scene, channel), _pose_of(Pose.from_matrix(ego_from_sensor))
-            self._share("calibrated_sensor", own, sensor_token=sensor, camera_intrinsic=intrinsics, **pose)
+            calibrated, pose = token("calibrated", scene, channel), _pose_of(Pose.from_matrix(ego_from_sensor))
+            self._share("calibrated_sensor", calibrated, sensor_token=sensor, camera_intrinsic=intrinsics, **pose)
 
     def _add(self, table: str, row: Row, chain: list[Row]) -> None:
         """Add a row to a table, linked with the last one of a chain in order of time, which it extends."""
@@ -218,12 +218,12 @@ class NewTables:
         self.rows[table].append(row)
         chain.append(row)
 
-    def _share(self, table: str, own: str, **columns: Any) -> str:
+    def _share(self, table: str, row_token: str, **columns: Any) -> str:
         """Add a row that several frames refer to once; returns its token."""
-        if own not in self._known:
-            self._known.add(own)
-            self.rows[table].append({"token": own, **columns})
-        return own
+        if row_token not in self._shared:
+            self._shared.add(row_token)
+            self.rows[table].append({"token": row_token, **columns})
+        return row_token
 
 
 def token(*parts: object) -> str:

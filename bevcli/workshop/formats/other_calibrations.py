@@ -57,7 +57,7 @@ def is_colmap(path: Path) -> bool:
 
 
 def _colmap_folder(path: Path, file: str) -> Path | None:
-    return next((path / part for part in ("", "sparse/0", "sparse") if (path / part / file).exists()), None)
+    return next((path / inner for inner in ("", "sparse/0", "sparse") if (path / inner / file).exists()), None)
 
 
 def read_colmap(path: Path) -> Cameras:
@@ -78,28 +78,28 @@ def read_colmap(path: Path) -> Cameras:
         numbers = [number_of(word) for word in words[:8]]
         if len(words) < 10 or None in numbers or words[8] not in by_id:
             raise InputError(f"{images}: line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-        _, *stated = np.array(numbers, dtype=np.float64)
-        pose = rigid(stated[4:], rotation_from_quaternion(stated[:4]))
+        _, *pose_numbers = np.array(numbers, dtype=np.float64)
+        pose = rigid(pose_numbers[4:], rotation_from_quaternion(pose_numbers[:4]))
         poses.setdefault((words[8], _folder_of(words[9], f"camera{words[8]}")), []).append(pose)
     if not poses:
         return {f"camera{key}": camera for key, camera in by_id.items()}
     return {
-        name: _posed(by_id[key], found, images.name, "camera_from_ego", "optical")
-        for (key, name), found in poses.items()
+        name: _posed(by_id[key], poses_of_camera, images.name, "camera_from_ego", "optical")
+        for (key, name), poses_of_camera in poses.items()
     }
 
 
 def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamera:
     focals, lens, names = COLMAP_MODELS.get(model, (0, "", ""))
-    wanted = focals + 2 + len(names.split())
-    if not focals or len(parameters) != wanted:
-        known = ", ".join(COLMAP_MODELS) if not focals else f"{wanted} parameters of {model}"
+    count = focals + 2 + len(names.split())
+    if not focals or len(parameters) != count:
+        expected = ", ".join(COLMAP_MODELS) if not focals else f"{count} parameters of {model}"
         raise InputError(
-            f"{where}: the camera model {model:.40} with {len(parameters)} parameters is unknown (expected {known})"
+            f"{where}: the camera model {model:.40} with {len(parameters)} parameters is unknown (expected {expected})"
         )
     fx, fy, (cx, cy) = parameters[0], parameters[focals - 1], parameters[focals : focals + 2]
-    stated = dict(zip(names.split(), parameters[focals + 2 :], strict=True))
-    coefficients = [stated.get(name, 0.0) for name in COEFFICIENTS[lens]] if lens else []
+    parameter_of = dict(zip(names.split(), parameters[focals + 2 :], strict=True))
+    coefficients = [parameter_of.get(name, 0.0) for name in COEFFICIENTS[lens]] if lens else []
     matrix = [[fx, 0, cx - PIXEL_CENTER], [0, fy, cy - PIXEL_CENTER], [0, 0, 1]]
     return StatedCamera(matrix, None, lens_fields(lens, coefficients, where))
 
@@ -144,8 +144,8 @@ def read_nerfstudio(path: Path) -> Cameras:
         )
     entries: dict[str, dict[str, Any]] = {}
     poses: dict[str, list[Array]] = {}
-    for place, frame in enumerate(frames):
-        name, where = _folder_of(str(frame.get("file_path", "")), "camera"), f"{file}: frame {place}"
+    for index, frame in enumerate(frames):
+        name, where = _folder_of(str(frame.get("file_path", "")), "camera"), f"{file}: frame {index}"
         entries.setdefault(name, {**document, **frame})
         poses.setdefault(name, []).append(require(parse_numbers, frame, "transform_matrix", (4, 4), where=where))
     made = {name: _nerf_camera(entry, f"{file}: camera {name}") for name, entry in entries.items()}
@@ -182,7 +182,7 @@ def read_kitti(path: Path) -> Cameras:
     rectified_from_camera0 = rigid(rotation=None if rectification is None else rectification.reshape(3, 3))
     cameras: Cameras = {}
     for key in rows:
-        if (found := re.fullmatch(r"P(_rect_0)?(\d)", key)) is None:
+        if (match := re.fullmatch(r"P(_rect_0)?(\d)", key)) is None:
             continue
         projection = _row(rows, key, 12, file).reshape(3, 4)
         matrix = projection[:, :3]
@@ -193,8 +193,8 @@ def read_kitti(path: Path) -> Cameras:
             camera_from_rectified = rigid(np.linalg.solve(matrix, projection[:, 3]))
             camera_from_velodyne = camera_from_rectified @ rectified_from_camera0 @ camera0_from_velodyne
             pose = StatedPose({"": EGO_FROM_VELODYNE @ inverse(camera_from_velodyne)}, "ego_from_camera", exact=True)
-        size = f"S_rect_0{found[2]}"
-        cameras[f"image_{'0' if found[1] else ''}{found[2]}"] = StatedCamera(
+        size = f"S_rect_0{match[2]}"
+        cameras[f"image_{'0' if match[1] else ''}{match[2]}"] = StatedCamera(
             (matrix / matrix[2, 2]).tolist(),
             (rows[size][0], rows[size][-1]) if size in rows else None,
             {"model": "none"},
@@ -214,8 +214,8 @@ def _camera0_from_velodyne(rows: Mapping[str, Array], file: Path) -> Array | Non
     beside = file.parent / "calib_velo_to_cam.txt"
     if not beside.exists():
         return None
-    stated = _kitti_rows(beside)
-    return rigid(_row(stated, "T", 3, beside), _row(stated, "R", 9, beside).reshape(3, 3))
+    rows_beside = _kitti_rows(beside)
+    return rigid(_row(rows_beside, "T", 3, beside), _row(rows_beside, "R", 9, beside).reshape(3, 3))
 
 
 def _kitti_rows(path: Path) -> dict[str, Array]:
@@ -231,7 +231,7 @@ def _kitti_rows(path: Path) -> dict[str, Array]:
 
 
 def _row(rows: Mapping[str, Array], key: str, count: int, path: Path) -> Array:
-    found = rows.get(key)
-    if found is None or found.size != count or not np.isfinite(found).all():
-        raise InputError(f"{path}: {key}: expected {count} finite numbers, found {0 if found is None else found.size}")
-    return found
+    row = rows.get(key)
+    if row is None or row.size != count or not np.isfinite(row).all():
+        raise InputError(f"{path}: {key}: expected {count} finite numbers, found {0 if row is None else row.size}")
+    return row

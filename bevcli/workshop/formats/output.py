@@ -89,8 +89,8 @@ class FolderWriter(ExitStack):
         self.enter_context(whole_folder(folder, parts))
         self.push(self._close)
 
-    def _close(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is None:
+    def _close(self, error_type: type[BaseException] | None, *error: object) -> None:
+        if error_type is None:
             self._finish()
             try:
                 self._read_back()
@@ -141,7 +141,7 @@ class NativeWriter(FolderWriter):
         self, folder: Path, *, with_ego_motion: bool, force: bool = False, facts: DriveFacts | None = None
     ) -> None:
         super().__init__(folder, PARTS, force=force)
-        self._facts = facts or DriveFacts()
+        self._drive_facts = facts or DriveFacts()
         self._with_ego_motion, self._reference = with_ego_motion, "world" if with_ego_motion else "ego"
         self._rig: CameraRig | None = None
         self._numbers: set[int] = set()
@@ -176,7 +176,7 @@ class NativeWriter(FolderWriter):
         if self._with_ego_motion:
             self._check_scenes()
             write_ego_motion(self.folder / "ego_motion.csv", _ego_motion(self._motion))
-        write_calibration(self.folder / "calibration.json", self._rig, self._facts)
+        write_calibration(self.folder / "calibration.json", self._rig, self._drive_facts)
 
     def _read_back(self) -> None:
         FolderDrive(self.folder, InputOptions(ego_motion="optional"))
@@ -246,16 +246,16 @@ def _ego_motion(rows: Mapping[int, tuple[Pose, Kinematics]]) -> EgoMotion:
     )
 
 
-def same_rig(one: CameraRig, other: CameraRig) -> bool:
+def same_rig(first: CameraRig, second: CameraRig) -> bool:
     """True if all names and numbers of two rigs are equal."""
     return (
-        one.names == other.names
-        and np.array_equal(one.ego_from_bev, other.ego_from_bev)
+        first.names == second.names
+        and np.array_equal(first.ego_from_bev, second.ego_from_bev)
         and all(
             (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
             and np.array_equal(a.intrinsics, b.intrinsics)
             and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(one.cameras, other.cameras, strict=True)
+            for a, b in zip(first.cameras, second.cameras, strict=True)
         )
     )
 

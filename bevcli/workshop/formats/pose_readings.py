@@ -44,7 +44,7 @@ class Reading:
 
     def differs_from(self, other: "Reading") -> bool:
         """Whether the vehicle turns otherwise, beyond `SAME_DEG`, as the world's own orientation is arbitrary."""
-        turns = [product(conjugate(each.quaternions[:1]), each.quaternions) for each in (self, other)]
+        turns = [product(conjugate(reading.quaternions[:1]), reading.quaternions) for reading in (self, other)]
         cosines = np.abs(np.sum(turns[0] * turns[1], axis=1)).clip(0, 1)
         return bool(np.degrees(2 * np.arccos(cosines)).max() > SAME_DEG)
 
@@ -57,8 +57,8 @@ def best_reading(
     ask: what the user may pass where the poses do not decide; "" where the first reading is the usual one.
     Raises InputError, also where the poses fit a camera that looks ahead, and not the vehicle.
     """
-    found = [reading.misfit_deg(times_ns) for reading in readings]
-    misfits, moves = [misfit for misfit, _ in found], found[0][1]
+    fits = [reading.misfit_deg(times_ns) for reading in readings]
+    misfits, moves = [misfit for misfit, _ in fits], fits[0][1]
     least, first = min(misfits), readings[0]
     decided = least <= LARGEST_MISFIT_DEG and (moves or not any(first.differs_from(other) for other in readings[1:]))
     if ask and len(readings) > 1 and not decided:
@@ -73,7 +73,7 @@ def best_reading(
 
 def _refuse_poses_of_camera(path: Path, reading: Reading, times_ns: NDArray[np.int64], drive: DrivePoses) -> None:
     for camera in drive.cameras_ahead if drive.stated.poses_of is None else ():
-        if min(each.misfit_deg(times_ns)[0] for each in of_vehicle(reading, camera)) <= LARGEST_MISFIT_DEG:
+        if min(candidate.misfit_deg(times_ns)[0] for candidate in of_vehicle(reading, camera)) <= LARGEST_MISFIT_DEG:
             raise InputError(
                 f"{path}: the poses are not those of the vehicle (x forward, z up), but fit a camera that looks ahead: "
                 f"pass `poses_of={camera.name}` (`--poses-of {camera.name}`), or `poses_of=vehicle` (`--poses-of "

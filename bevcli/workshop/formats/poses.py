@@ -117,7 +117,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     Raises InputError for a file that lacks something, or that can be read in two ways.
     """
     table = read_table(path)
-    name = None if table is None else next((name for name, kind in KINDS.items() if kind.is_it(table)), None)
+    name = None if table is None else next((name for name, layout in KINDS.items() if layout.is_it(table)), None)
     if table is None or name is None:
         return None
     positions, origin = _positions(table)
@@ -128,17 +128,17 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     camera, of = _camera(path, KINDS[name], drive)
     readings, ask = _readings(table, positions, drive)
     if camera is not None:
-        readings = [each for reading in readings for each in of_vehicle(reading, camera)]
-    chosen = best_reading(path, readings, times, ask, drive)
+        readings = [candidate for reading in readings for candidate in of_vehicle(reading, camera)]
+    best = best_reading(path, readings, times, ask, drive)
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
-    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, chosen.words, of)
+    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, best.words, of)
     note = f"poses: {', '.join(word for word in words if word)}"
     if drive.times_ns is not None:
         covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
         count = len(drive.times_ns)
         note += f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
-    kinematics = derive_kinematics(times, chosen.translations, chosen.quaternions)
-    poses = (times, chosen.translations, chosen.quaternions)
+    kinematics = derive_kinematics(times, best.translations, best.quaternions)
+    poses = (times, best.translations, best.quaternions)
     return ReadPoses(EgoMotion(*poses, *kinematics, velocities_are_stated=False), (note,), origin)
 
 
@@ -166,15 +166,15 @@ def read_table(path: Path) -> Table | None:
         unnamed = {12: MATRIX, 8: TUM}.get(count, ())
         if separator == "," and count in (8, 17):  # EuRoC's own order
             unnamed = ("time", *VECTOR, *QUATERNION)
-        places, names = {quantity: place for place, quantity in enumerate(unnamed)}, [""] * count
+        places, names = {quantity: index for index, quantity in enumerate(unnamed)}, [""] * count
     if not places:
         return None
-    table = Table(path, {quantity: names[place] for quantity, place in places.items()}, [], separator)
+    table = Table(path, {quantity: names[index] for quantity, index in places.items()}, [], separator)
     for number, text in rows:
         cells = _cells(text.replace(",", ".") if separator in (";", "\t") else text, separator)
         if len(cells) != count:
             raise InputError(f"{path}: line {number} has {len(cells)} cells (expected {count}, as in the first row)")
-        table.rows.append(CsvRow(path, number, {quantity: cells[place] for quantity, place in places.items()}))
+        table.rows.append(CsvRow(path, number, {quantity: cells[index] for quantity, index in places.items()}))
     return table
 
 
@@ -186,14 +186,14 @@ def _cells(text: str, separator: str | None) -> list[str]:
 def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
     """The place of each known quantity. Raises InputError where two columns have the same."""
     places: dict[str, int] = {}
-    for place, name in enumerate(names):
+    for index, name in enumerate(names):
         plain = re.sub(r"\s*[\[(].*", "", name)  # without the unit
         quantity = next((quantity for quantity, pattern in NAMES.items() if re.fullmatch(pattern, plain)), None)
         if quantity in places:
             both = f'"{names[places[quantity]]}" and "{name}"'
             raise InputError(f"{path}: the columns {both} are both {quantity}: remove one")
         if quantity is not None:
-            places[quantity] = place
+            places[quantity] = index
     return places
 
 
@@ -233,11 +233,11 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
         both = [row.integer(seconds) * 10**9 + row.integer("nanoseconds") for row in rows]
         return np.array(both, dtype=np.int64), "seconds and nanoseconds"
     elif not table.has("time"):
-        known = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
-        raise InputError(f"{table.path}: a column of times is missing (expected a name such as {known})")
+        examples = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
+        raise InputError(f"{table.path}: a column of times is missing (expected a name such as {examples})")
     values = [_decimal(row) for row in rows]
-    stated = _UNIT_OF_NAME.search(name)
-    of_name = cast("TimeKind | None", stated and (stated[1] or stated[2]))
+    unit_in_name = _UNIT_OF_NAME.search(name)
+    of_name = cast("TimeKind | None", unit_in_name and (unit_in_name[1] or unit_in_name[2]))
     unit = drive.stated.pose_times or of_name or _unit(table.path, values, positions, drive)
     if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
         raise InputError(
@@ -297,10 +297,10 @@ def _covered(first: Decimal | int, last: Decimal | int, times_ns: NDArray[np.int
     return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
 
 
-def _camera(path: Path, kind: Kind, drive: DrivePoses) -> tuple[Camera | None, str]:
+def _camera(path: Path, layout: Kind, drive: DrivePoses) -> tuple[Camera | None, str]:
     """The camera whose poses the file has, None for the vehicle; and the words for that."""
     cameras = drive.rig.cameras
-    if drive.stated.poses_of == "vehicle" or (drive.stated.poses_of is None and not kind.of_camera):
+    if drive.stated.poses_of == "vehicle" or (drive.stated.poses_of is None and not layout.of_camera):
         return None, "of the vehicle"
     if drive.stated.poses_of is not None:
         named = next((camera for camera in cameras if camera.name == drive.stated.poses_of), None)
@@ -360,11 +360,11 @@ def _readings_of_angles(table: Table, positions: Array, drive: DrivePoses) -> tu
     name = "heading" if table.has("heading") else "yaw"
     if table.has("heading", "yaw"):
         raise InputError(f"{table.path}: has a column of yaw and one of heading: remove one")
-    angles, stated, of_gps = table.numbers("roll", "pitch", name), table.columns[name], table.has("latitude")
+    angles, heading, of_gps = table.numbers("roll", "pitch", name), table.columns[name], table.has("latitude")
     units = ["radians", "degrees"]
     if drive.stated.pose_angles is not None:
         units = ["degrees" if drive.stated.pose_angles == "compass" else drive.stated.pose_angles]
-    elif mark := re.search(r"[_\[( ](deg|rad)", stated):
+    elif mark := re.search(r"[_\[( ](deg|rad)", heading):
         units = [unit for unit in units if unit.startswith(mark[1])]
     elif np.abs(angles).max() > LARGEST_RADIANS:
         units = ["degrees"]
@@ -383,4 +383,4 @@ def _readings_of_angles(table: Table, positions: Array, drive: DrivePoses) -> tu
             words = f"{name} in {unit} {turn}"
             readings.append(Reading(words, positions, quaternions_of_angles(roll, pitch, yaw)))
     names = ["degrees", "radians", *(["compass"] if name == "heading" or of_gps else [])]
-    return readings, "" if usual else " or ".join(f"`pose_angles={each}` (`--pose-angles`)" for each in names)
+    return readings, "" if usual else " or ".join(f"`pose_angles={unit_name}` (`--pose-angles`)" for unit_name in names)

@@ -47,7 +47,7 @@ CLASS_OF_CATEGORY = {
 }
 
 
-def open_t4(path: Path, common: InputOptions, own: Format) -> TableDrive:
+def open_t4(path: Path, common: InputOptions, options: Format) -> TableDrive:
     """The keyframes of a T4 dataset.
 
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the

@@ -17,16 +17,16 @@ from bevcli.workshop.formats.calibrations import SEVERAL
 from bevcli.workshop.formats.unlisted import covered, video_images
 
 
-def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDrive:
+def open_video(path: Path, common: InputOptions, options: FolderOptions) -> ListedDrive:
     """A video as a `Drive`. Raises InputError."""
-    video = video_images(path, own.start_ns or 0, own.image_rate_hz)
-    given = draft_of(own, path)
-    if given is None:
+    video = video_images(path, options.start_ns or 0, options.image_rate_hz)
+    draft = draft_of(options, path)
+    if draft is None:
         raise InputError(
             f"{path}: a video does not state its camera: pass `fov_deg=70` (`--fov 70`) and `height=1.5` (`--height "
             "1.5`), or `calibration` (`--calibration FILE`)"
         )
-    rig = given.rig
+    rig = draft.rig
     if len(rig.cameras) != 1:  # of a calibration.json
         if path.stem not in rig.names:
             raise InputError(f"{path}: {SEVERAL.format(counted(len(rig.cameras), 'cameras'), ', '.join(rig.names))}")
@@ -36,11 +36,11 @@ def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDr
         FrameEntry(FrameStamp(index, "", int(time)), {name: video.image(index)}, {}, f"{path}#{index}")
         for index, time in enumerate(video.times_ns)
     )
-    start = "time 0 (state `start_ns` (`--start-ns`))" if own.start_ns is None else f"{own.start_ns} ns"
+    start = "time 0 (state `start_ns` (`--start-ns`))" if options.start_ns is None else f"{options.start_ns} ns"
     understood = f"{len(entries)} images at {1e9 / video.period_ns:g} Hz from {start} on"
     poses = ReadPoses(None)
-    if own.ego_motion_file is not None and common.ego_motion != "static":
-        poses = read_poses(own.ego_motion_file, DrivePoses(rig, own, video.times_ns))
+    if options.ego_motion_file is not None and common.ego_motion != "static":
+        poses = read_poses(options.ego_motion_file, DrivePoses(rig, options, video.times_ns))
     elif common.ego_motion == "required":
         raise InputError(
             f"{path}: a video has no poses of the vehicle: pass `ego_motion_file` (`--ego-motion FILE`), "
@@ -48,17 +48,17 @@ def open_video(path: Path, common: InputOptions, own: FolderOptions) -> ListedDr
             'without history, or `ego_motion="static"` (`--static`) if the vehicle stands'
         )
     motion = poses.motion
-    if motion is not None and own.ego_motion_file is not None:
+    if motion is not None and options.ego_motion_file is not None:
         entries, understood = covered((entries, understood), motion)
         check_covered(
-            own.ego_motion_file, poses, entries, "state the time of the first image by `start_ns` (`--start-ns`)"
+            options.ego_motion_file, poses, entries, "state the time of the first image by `start_ns` (`--start-ns`)"
         )
     assumed = bev_frame_notes(rig, "the calibration")
-    notes = (*given.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
+    notes = (*draft.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
     if motion is None and common.ego_motion != "measured":
         without = "no history is used, and boxes are in the ego frame"
         notes += (f"a video has no poses: {without} (`odometry=True` (`--odometry`) measures them from the images)",)
     sequence = ListedDrive(path.parent, common, rig, entries, motion, notes=notes, input_files=(path,))
     sequence.name = path.resolve().stem
-    sequence.facts = replace(given.facts, geo_origin=given.facts.geo_origin or poses.geo_origin)
+    sequence.facts = replace(draft.facts, geo_origin=draft.facts.geo_origin or poses.geo_origin)
     return sequence

@@ -39,9 +39,9 @@ def open_model(name: str, *, fetch: bool = False) -> HubModel:
         WeightsError: the name is of another form, there is no such model, it cannot be downloaded, or it is damaged.
         BevcliError: huggingface_hub is not installed.
     """
-    place = name.partition(":")[2]
-    if place.startswith((".", "/", "~")):
-        return read_folder(Path(place).expanduser(), f"model in {place}")
+    folder_name = name.partition(":")[2]
+    if folder_name.startswith((".", "/", "~")):
+        return read_folder(Path(folder_name).expanduser(), f"model in {folder_name}")
     match = _NAME.fullmatch(name)
     if match is None:
         raise WeightsError(

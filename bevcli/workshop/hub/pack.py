@@ -72,18 +72,18 @@ def pack_model(
         WeightsError: there are no weights, or they do not fit.
         OutputError: a file exists, or cannot be written.
     """
-    chosen, name, out = gather(PackOptions, options, changes), str(model), Path(folder)
+    pack_options, name, out = gather(PackOptions, options, changes), str(model), Path(folder)
     targets = [out / file_name for file_name in (CONFIG, WEIGHTS, CARD)]
     there = next((target for target in targets if target.exists()), None)
-    if there is not None and not chosen.force:
+    if there is not None and not pack_options.force:
         raise OutputError(
             f"{there}: already exists; choose another folder, or pass `force=True` (`--force`) to overwrite it"
         )
-    if name.endswith(".toml") and chosen.weights is None:
+    if name.endswith(".toml") and pack_options.weights is None:
         raise WeightsError(f"{name}: a model file holds no weights: pass `weights` (`--weights FILE`)")
     contents, file = read_model_file(name)
     config = config_of_table(contents, file)
-    checkpoint = read_checkpoint(weights_file(chosen.weights or Path(name)))
+    checkpoint = read_checkpoint(weights_file(pack_options.weights or Path(name)))
     require_fit(checkpoint, name, expected_state(config))
     table = as_table(config, tracker_of_table(contents, config, file))
     if TRAINING in contents:
@@ -91,22 +91,22 @@ def pack_model(
     tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
     weights = safetensors.torch.save(tensors, dict(checkpoint.facts))
     content_hash = Known(hashlib.sha256(weights).hexdigest(), len(weights))
-    facts = facts_of(name, checkpoint, chosen)
+    card_facts = facts_of(name, checkpoint, pack_options)
     packed = PackedConfig(
         library_name="bevcli",
         bevcli_version=__version__,
         format=FORMAT,
         weights=content_hash,
         model=table,
-        limit=facts.limit,
+        limit=card_facts.limit,
     )
     texts = [
         json.dumps(msgspec.to_builtins(packed), indent=1, ensure_ascii=False) + "\n",
-        model_card(config, facts, checkpoint.parameters),
+        model_card(config, card_facts, checkpoint.parameters),
     ]
     for target, content in zip(targets, (texts[0].encode(), weights, texts[1].encode()), strict=True):
         write_whole(target, content, parents=True)
-    notes = list(facts.missing)
+    notes = list(card_facts.missing)
     if any(settings.mesh for settings in config.class_settings.values()):
         notes.append("meshes of classes are files of this machine: the folder has none")
     return tuple(targets), tuple(notes)
@@ -142,29 +142,29 @@ class CardFacts:
             "no data of the training: pass `datasets` (`--datasets NAME`)": self.datasets or self.limit,
             "no scores: pass `scores` (`--scores FILE.json`)": self.scores,
         }
-        return tuple(f"the model card states {text}" for text, stated in notes.items() if not stated)
+        return tuple(f"the model card states {text}" for text, statement in notes.items() if not statement)
 
 
 def facts_of(name: str, checkpoint: Checkpoint, options: PackOptions) -> CardFacts:
     """What is known of the weights of a model, and what the options state. Raises InputError for wrong scores."""
     rigs = checkpoint.facts.get("training_rigs", "")
-    known = CardFacts(rigs=rigs)
+    recorded = CardFacts(rigs=rigs)
     named = all_weights().get(name) if options.weights is None else None
     if checkpoint.path == bundled_weights(name):
         bundled_scores, scored_on, limit = BUNDLED[name]
-        known = CardFacts("Apache-2.0", (), bundled_scores, scored_on, "", limit, rigs)
+        recorded = CardFacts("Apache-2.0", (), bundled_scores, scored_on, "", limit, rigs)
     elif named is not None:
         source, data = named.source, ("nuscenes",) if named.source.published else ()
         first_published = source.page or source.url
-        known = CardFacts(source.licence, data, source.published, PUBLISHED_DATA, first_published, "", rigs)
-    scores = known.scores if options.scores is None else _read_scores(options.scores)
+        recorded = CardFacts(source.licence, data, source.published, PUBLISHED_DATA, first_published, "", rigs)
+    scores = recorded.scores if options.scores is None else _read_scores(options.scores)
     return CardFacts(
-        options.licence or known.licence,
-        options.datasets or known.datasets,
+        options.licence or recorded.licence,
+        options.datasets or recorded.datasets,
         scores,
-        options.scored_on or (known.scored_on if options.scores is None else "held-out drives"),
-        known.source,
-        known.limit,
+        options.scored_on or (recorded.scored_on if options.scores is None else "held-out drives"),
+        recorded.source,
+        recorded.limit,
         rigs,
     )
 
@@ -186,11 +186,11 @@ def _read_scores(path: Path) -> dict[str, float]:
 def model_card(config: ModelConfig, facts: CardFacts, values: int) -> str:
     """The text of README.md. values: number of values in all tensors."""
     front = yaml.safe_dump(_front_matter(config, facts), sort_keys=False, allow_unicode=True, width=1000)
-    paper, kind = PAPERS.get(config.architecture, ""), config.architecture
+    paper, architecture = PAPERS.get(config.architecture, ""), config.architecture
     grid, (width, height) = config.bev_grid, config.image.size
     outputs = "3D boxes with velocities" + (", a map of the ground" if "segmentation" in config.heads else "")
     rows = {
-        "architecture": f"[{kind}]({paper})" if paper else kind,
+        "architecture": f"[{architecture}]({paper})" if paper else architecture,
         "values": f"{values / 1e6:.1f} million",
         "input": f"images of {len(config.cameras)} cameras or as many as there are, scaled to {width} x {height}; "
         f"ego-motion; {config.rate_hz:g} frames a second",

@@ -33,22 +33,22 @@ def odometry(
     """
     from bevcli.workshop.odometry import compare, drives, measure, picture, recording, report
 
-    reading = replace(source, ego_motion="measured")
-    opened = bevcli.open_sequence(sequence, reading, ground_truth=False, **format_options)
+    input_options = replace(source, ego_motion="measured")
+    opened = bevcli.open_sequence(sequence, input_options, ground_truth=False, **format_options)
     drive = picture.WatchedDrive(opened if source.rate_hz or source.every else drives.at_most_rate(opened))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
     with Progress(len(drive.stamps) - 1, "steps", drive.notes) as progress:
         motion = measure.MeasuredMotion.of(drive, progress.over(measure.measure_steps(drive, options)))
     report.check_measured(motion)
-    stated = drive.stated_poses
-    difference = None if stated is None else report.against_stated(motion, stated)
+    stated_poses = drive.stated_poses
+    difference = None if stated_poses is None else report.against_stated(motion, stated_poses)
     indices = [stamp.index for stamp in drive.stamps]
     findings = () if drive.ego_motion is None else compare.compare(drive.ego_motion, motion, indices)
     written = report.write_report(motion, out, difference, findings)
     road = picture.stitched(drive, motion.poses)
-    picture.write_picture(out / "odometry.png", motion, road, stated)
-    recording.write_recording(out / "odometry.rrd", motion, drive, road, stated)
+    picture.write_picture(out / "odometry.png", motion, road, stated_poses)
+    recording.write_recording(out / "odometry.rrd", motion, drive, road, stated_poses)
     written += [out / "odometry.png", out / "odometry.rrd"]
     say((report.to_json if as_json else report.report_text)(motion, difference, findings))
     say("Written: " + ", ".join(map(str, written)), err=as_json)

@@ -83,15 +83,15 @@ def compare(stated: EgoMotion, measured: MeasuredMotion, frames: Sequence[int] |
         reasons = [step.reason for step in measured.steps if step.reason]
         return (not_compared(f"{counted(used, 'steps')} could be measured" + (f": {reasons[0]}" if reasons else "")),)
     steps = steps_between(poses)
-    chosen = as_it_is = _candidate(shown, steps)
+    outcome = as_it_is = _candidate(shown, steps)
     if not _stands(shown, shown.steps):  # else any scale near 0 fits
         fitting = [candidate for candidate in (as_it_is, *_candidates(shown, rows, steps)) if candidate.share >= MOST]
         least = min((candidate.cost for candidate in fitting), default=np.inf)
         best = next((candidate for candidate in fitting if candidate.cost <= least + SAME), as_it_is)
-        chosen = best if as_it_is.cost - best.cost > MUCH else as_it_is
+        outcome = best if as_it_is.cost - best.cost > MUCH else as_it_is
     numbers = range(len(shown.times_ns)) if frames is None else frames
-    if chosen.share >= MOST:
-        return chosen.findings or _jumps(shown, chosen.steps, numbers)
+    if outcome.share >= MOST:
+        return outcome.findings or _jumps(shown, outcome.steps, numbers)
     return (_wrong(shown, steps),)
 
 
@@ -128,8 +128,8 @@ def _candidates(measured: MeasuredSteps, rows: Poses, steps: Array) -> Iterator[
     fit, *counts = (measured.distances(both) < FITS)[:, measured.is_used].sum(1).tolist()
     mistaken: list[tuple[tuple[Finding, ...], Array]] = []
     for mistake, count in zip(undone, counts, strict=True):
-        found = mistake.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
-        finding = _error(mistake.code, mistake.message, found, mistake.expected, mistake.advice)
+        description = mistake.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
+        finding = _error(mistake.code, mistake.message, description, mistake.expected, mistake.advice)
         mistaken.append(((finding,), mistake.steps))
     yield from _scaled(measured, mistaken)
 
@@ -143,8 +143,8 @@ def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Arr
     length = np.einsum("nki,kij,nkj->nk", stacked[..., :3, 3], precisions, stacked[..., :3, 3]) + 1e-12
     scales = np.median((along / length)[:, measured.is_used], axis=1)  # to undo it
     for _ in range(ROUNDS):
-        left = scales[:, None, None] * stacked[..., :3, 3] - moved
-        squared = np.einsum("nki,kij,nkj->nk", left, precisions, left)
+        residuals = scales[:, None, None] * stacked[..., :3, 3] - moved
+        squared = np.einsum("nki,kij,nkj->nk", residuals, precisions, residuals)
         weights = measured.weights(squared)
         scales = (weights * along).sum(1) / (weights * length).sum(1)
     deviations = np.sqrt(np.maximum((weights * squared).sum(1) / (3 * weights.sum(1)), 1) / (weights * length).sum(1))
@@ -166,14 +166,14 @@ def _scale_finding(factor: float, deviation: float) -> tuple[Finding, ...]:
     if abs(factor - 1) < max(LEAST_SCALE, CERTAIN * deviation):
         return ()
     digits = 2 if factor > 0.1 else 5
-    found = f"{factor:.{digits}f} ± {deviation:.{digits}f} times as long as the images show"
+    description = f"{factor:.{digits}f} ± {deviation:.{digits}f} times as long as the images show"
     near = min(SCALES, key=lambda scale: abs(np.log(scale / factor)))
     if abs(np.log(near / factor)) < max(LEAST_SCALE, 3 * deviation / factor):
         message, advice = SCALES[near]
-        return (_error("motion-scale", message, found, "1", advice),)
+        return (_error("motion-scale", message, description, "1", advice),)
     advice = f"correct a wheel radius or a unit by {1 / factor:.3f}, or the heights of the cameras by {factor:.3f}"
     message = "the poses have another scale than the images"
-    return (_error("motion-scale", message, found, "1", advice, abs(factor - 1) > LARGE_SCALE),)
+    return (_error("motion-scale", message, description, "1", advice, abs(factor - 1) > LARGE_SCALE),)
 
 
 def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
@@ -192,9 +192,9 @@ def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
     if abs(turn) < max(LEAST_TURN, CERTAIN * deviation):
         return _candidate(measured, undone, parameters=1)
     side = "left" if turn > 0 else "right"
-    found = f"x points {np.degrees(abs(turn)):.1f}° ± {np.degrees(deviation):.1f}° to the {side} of forward"
+    description = f"x points {np.degrees(abs(turn)):.1f}° ± {np.degrees(deviation):.1f}° to the {side} of forward"
     message, advice = "x of the poses is not forward", "turn their rotations about z, or check the cameras' yaw"
-    finding = _error("motion-axes", message, found, "x forward", advice, abs(turn) > LARGE_TURN)
+    finding = _error("motion-axes", message, description, "x forward", advice, abs(turn) > LARGE_TURN)
     return _candidate(measured, undone, (finding,), 1)
 
 
@@ -215,10 +215,10 @@ def _of_another_point(measured: MeasuredSteps, steps: Array) -> _Candidate:
     if not (np.abs(point) > np.maximum(LEAST_ORIGIN_M, CERTAIN * deviations)).any():
         return _candidate(measured, undone, parameters=2)
     (x, y), (dx, dy) = point.tolist(), deviations.tolist()
-    found = f"x {x:+.2f} ± {dx:.2f} m, y {y:+.2f} ± {dy:.2f} m from it"
+    description = f"x {x:+.2f} ± {dx:.2f} m, y {y:+.2f} ± {dy:.2f} m from it"
     message = "the poses are those of another point of the vehicle than the origin of the calibration"
     advice = "give both for the same point, on the ground below the centre of the rear axle"
-    finding = _error("motion-origin", message, found, "the ego origin", advice, is_error=False)
+    finding = _error("motion-origin", message, description, "the ego origin", advice, is_error=False)
     return _candidate(measured, undone, (finding,), 2)
 
 
@@ -240,25 +240,25 @@ def _of_another_time(measured: MeasuredSteps, rows: Poses) -> Iterator[_Candidat
     findings: tuple[Finding, ...] = ()
     if abs(offset) > max(LEAST_NS, CERTAIN * deviation):
         word = "late" if offset > 0 else "early"
-        found = f"their times are {abs(offset) / 1e6:.0f} ± {deviation / 1e6:.0f} ms too {word}"
+        description = f"their times are {abs(offset) / 1e6:.0f} ± {deviation / 1e6:.0f} ms too {word}"
         message, advice = "the poses are of another time than the images", "correct the times of the poses or frames"
-        findings = (_error("motion-time", message, found, "0 ms", advice, abs(offset) >= LARGE_NS),)
+        findings = (_error("motion-time", message, description, "0 ms", advice, abs(offset) >= LARGE_NS),)
     far = abs(offset) >= FAR_NS
     # The cost of all steps from that of the covered ones; that of two parameters, as it is the best of many times.
-    part = measured.is_used.sum() / there.is_used.sum()
+    cost_factor = measured.is_used.sum() / there.is_used.sum()
     for candidate in (_candidate(there, steps[1]), *_scaled(there, [((), steps[1])])):
         share = candidate.share if not far or candidate.share >= MOST_FAR else 0.0
         told = (*findings, *candidate.findings)
-        yield replace(candidate, cost=candidate.cost * part + 2 * PARAMETER, share=share, findings=told)
+        yield replace(candidate, cost=candidate.cost * cost_factor + 2 * PARAMETER, share=share, findings=told)
 
 
 def _time_offset(measured: MeasuredSteps, rows: Poses) -> int | None:
     """The time to add to those of the frames at which the poses fit best, nanoseconds; None without other times."""
-    chosen = np.flatnonzero(measured.is_used)[:SEARCHED]
-    times_ns = np.stack([measured.times_ns[chosen], measured.times_ns[chosen + 1]], axis=-1)  # (K, 2)
+    indices = np.flatnonzero(measured.is_used)[:SEARCHED]
+    times_ns = np.stack([measured.times_ns[indices], measured.times_ns[indices + 1]], axis=-1)  # (K, 2)
     few = replace(
-        measured, steps=measured.steps[chosen], precisions=measured.precisions[chosen],
-        is_used=np.ones(len(chosen), dtype=bool),
+        measured, steps=measured.steps[indices], precisions=measured.precisions[indices],
+        is_used=np.ones(len(indices), dtype=bool),
     )  # fmt: skip
     best, step = 0, TIME_STEP_NS
     offsets = np.arange(-LONGEST_NS, LONGEST_NS + 1, step)
@@ -280,8 +280,8 @@ def _wrong(measured: MeasuredSteps, steps: Array) -> Finding:
     """The finding where nothing fits: one of both stands still, or the poses are those of another drive."""
     used = measured.is_used
     fits = int((measured.distances(steps) < FITS)[used].sum())
-    stated, shown = (np.linalg.norm(motion[used, :3, 3], axis=1) for motion in (steps, measured.steps))
-    code, both = "motion-stands", f"{stated.sum():.1f} m in the poses, {shown.sum():.1f} m in the images"
+    stated_m, shown_m = (np.linalg.norm(motion[used, :3, 3], axis=1) for motion in (steps, measured.steps))
+    code, both = "motion-stands", f"{stated_m.sum():.1f} m in the poses, {shown_m.sum():.1f} m in the images"
     if _stands(measured, steps):
         message, advice = "the poses stand still, but the images move", "give the poses of the drive, or measure them"
         return _error(code, message, both, "equal", advice)
@@ -292,8 +292,8 @@ def _wrong(measured: MeasuredSteps, steps: Array) -> Finding:
         return not_compared(f"{fits} of {int(used.sum())} steps fit, and no common mistake explains the others")
     message = "the poses do not fit the images, and no common mistake explains it"
     advice = "take the poses of this drive, or check the cameras' poses"
-    found = f"{fits} of {int(used.sum())} steps fit; {both}"
-    return _error("motion-wrong-drive", message, found, "all steps fit", advice)
+    description = f"{fits} of {int(used.sum())} steps fit; {both}"
+    return _error("motion-wrong-drive", message, description, "all steps fit", advice)
 
 
 def _stands(measured: MeasuredSteps, steps: Array) -> bool:
@@ -314,9 +314,9 @@ def _jumps(measured: MeasuredSteps, steps: Array, frames: Sequence[int]) -> tupl
     more = f" and {len(jumps) - 5} more" if len(jumps) > 5 else ""
     worst = jumps[np.linalg.norm(off[jumps, 3:5], axis=1).argmax()]
     distance, turn_deg = np.linalg.norm(off[worst, 3:5]), np.degrees(abs(off[worst, 2]))
-    found = f"between frames {between}{more}; {distance:.1f} m, {turn_deg:.1f}°"
+    description = f"between frames {between}{more}; {distance:.1f} m, {turn_deg:.1f}°"
     message, advice = "the poses jump, and the images do not", "correct these poses, or leave the frames out"
-    return (_error("motion-jumps", message, found, "as the images show", advice),)
+    return (_error("motion-jumps", message, description, "as the images show", advice),)
 
 
 def _roughness(times_ns: NDArray[np.int64], steps: Array) -> Array:

@@ -45,7 +45,7 @@ def road_flow(first: RoadPicture, second: RoadPicture, yaw: float, shift: Array,
                second.of[rows.clip(0, SHAPE[0] - 1), columns.clip(0, SHAPE[1] - 1)]]  # fmt: skip
     seen = np.minimum(*cameras) >= 0
     told = contrast(first.texture, at)
-    points, there = (np.column_stack([each, each @ of.slopes]) for each, of in ((points, first), (there, second)))
+    points, there = (np.column_stack([xy, xy @ of.slopes]) for xy, of in ((points, first), (there, second)))
     return RoadFlow(points[seen], there[seen], told[seen], np.stack(cameras, -1)[seen].astype(np.int64))
 
 

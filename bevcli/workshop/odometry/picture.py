@@ -137,8 +137,8 @@ def stitched(drive: WatchedDrive, poses: Array) -> StitchedRoad:
         size = int(x1 - x0), int(y1 - y0)
         colors = cv2.warpAffine(road, local, size, flags=cv2.INTER_LINEAR)
         weights = cv2.warpAffine(weight, local, size, flags=cv2.INTER_NEAREST)
-        part, closer = best[y0:y1, x0:x1], weights > best[y0:y1, x0:x1]
-        image[y0:y1, x0:x1][closer], part[closer] = colors[closer], weights[closer]
+        best_weights, closer = best[y0:y1, x0:x1], weights > best[y0:y1, x0:x1]
+        image[y0:y1, x0:x1][closer], best_weights[closer] = colors[closer], weights[closer]
     return StitchedRoad(
         image, (float(low[0]), float(low[0] + cell * width)), (float(high[1] - cell * height), float(high[1]))
     )
@@ -152,14 +152,14 @@ def _world_from_patch(world_from_ego: Array) -> Array:
     return flat @ ego_from_patch
 
 
-def write_picture(path: Path, motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> None:
-    """Write odometry.png. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
-    figure = draw(motion, road, stated)
+def write_picture(path: Path, motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Array] | None) -> None:
+    """Write odometry.png. stated_poses: (F, 4, 4) poses that the drive states. Raises OutputError."""
+    figure = draw(motion, road, stated_poses)
     with whole_file(path, parents=True) as unfinished:
         figure.savefig(unfinished, dpi=110, format="png")
 
 
-def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> Figure:
+def draw(motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Array] | None) -> Figure:
     """The figure: the way on the road, beside or above the curves."""
     height, width = road.image.shape[:2]
     wide = width > 1.6 * height
@@ -168,8 +168,8 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | N
     grid = figure.add_gridspec(3 if wide else 2, 1 if wide else 2, height_ratios=[2, 1, 1] if wide else None)
     cells = [grid[0], grid[1], grid[2]] if wide else [grid[:, 0], grid[0, 1], grid[1, 1]]
     way, speed, yaw_rate = (figure.add_subplot(cell) for cell in cells)
-    _draw_way(way, motion, road, stated)
-    others = None if stated is None else _motion_of(motion, stated)
+    _draw_way(way, motion, road, stated_poses)
+    others = None if stated_poses is None else _motion_of(motion, stated_poses)
     _draw_curve(speed, motion, speeds(motion), None if others is None else speeds(others)[0], "speed, m/s")
     of_stated = None if others is None else yaw_rates_deg(others)[0]
     _draw_curve(yaw_rate, motion, yaw_rates_deg(motion), of_stated, "yaw rate, °/s")
@@ -179,20 +179,20 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | N
     return figure
 
 
-def _motion_of(motion: MeasuredMotion, stated: Sequence[Array]) -> MeasuredMotion:
+def _motion_of(motion: MeasuredMotion, stated_poses: Sequence[Array]) -> MeasuredMotion:
     """Stated poses as a motion, for the curves."""
     steps = [
         replace(step, ego_a_from_ego_b=inverse(a) @ b)
-        for step, (a, b) in zip(motion.steps, pairwise(stated), strict=True)
+        for step, (a, b) in zip(motion.steps, pairwise(stated_poses), strict=True)
     ]
     return replace(motion, steps=tuple(steps))
 
 
-def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Sequence[Array] | None) -> None:
+def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Array] | None) -> None:
     axes.imshow(road.image, extent=(*road.x_range_m, *road.y_range_m), interpolation="bilinear")
     positions = motion.poses[:, :2, 3]
-    if stated is not None:
-        moved = np.stack([inverse(stated[0]) @ pose for pose in stated])[:, :2, 3]
+    if stated_poses is not None:
+        moved = np.stack([inverse(stated_poses[0]) @ pose for pose in stated_poses])[:, :2, 3]
         axes.plot(*moved.T, color=STATED, linewidth=3.5, alpha=0.6, label="stated")
     axes.plot(*positions.T, color=WAY, linewidth=1.5, marker="o", markersize=2.5, label="measured")
     guessed = [index for index, step in enumerate(motion.steps) if step.reason]
@@ -208,14 +208,14 @@ def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated: Se
 
 
 def _draw_curve(
-    axes: Axes, motion: MeasuredMotion, measured: tuple[Array, Array], stated: Array | None, label: str
+    axes: Axes, motion: MeasuredMotion, measured: tuple[Array, Array], stated_values: Array | None, label: str
 ) -> None:
     """measured: values (F - 1,) and standard deviations."""
     values, deviations = measured
     times = (motion.timestamps_ns - motion.timestamps_ns[0]) / 1e9
     middles = (times[:-1] + times[1:]) / 2
-    if stated is not None:
-        axes.plot(middles, stated, color=STATED, linewidth=3.5, alpha=0.6)
+    if stated_values is not None:
+        axes.plot(middles, stated_values, color=STATED, linewidth=3.5, alpha=0.6)
     axes.fill_between(middles, values - deviations, values + deviations, color=WAY, alpha=0.3, linewidth=0)
     axes.plot(middles, values, color=WAY, linewidth=1.5)
     guessed = np.array([bool(step.reason) for step in motion.steps])
@@ -224,6 +224,6 @@ def _draw_curve(
     axes.set_title(f"± σ, {np.median(deviations):.3f} (median)" if len(values) else "", fontsize=9, loc="right")
     axes.grid(visible=True, color="#e6e6e6")
     if len(values):  # a guess's wide deviation must not hide the curve
-        shown = values if stated is None else np.concatenate([values, stated])
+        shown = values if stated_values is None else np.concatenate([values, stated_values])
         margin = max(0.15 * float(np.ptp(shown)), 3 * float(np.median(deviations)), 0.5)
         axes.set_ylim(float(shown.min()) - margin, float(shown.max()) + margin)

@@ -26,15 +26,15 @@ RESIDUALS_PX, RESIDUAL_COLORS = (0.5, 1.5), ((70, 220, 120), (245, 222, 90), (25
 
 
 def write_recording(
-    path: Path, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, stated: Items[Array] | None
+    path: Path, motion: MeasuredMotion, drive: WatchedDrive, road: StitchedRoad, stated_poses: Items[Array] | None
 ) -> None:
-    """Write the recording. stated: (F, 4, 4) poses that the drive states. Raises OutputError."""
+    """Write the recording. stated_poses: (F, 4, 4) poses that the drive states. Raises OutputError."""
     with _layout(drive, road).saved_to(path, "bevcli-odometry") as stream:
-        _log_way(stream, motion, road, stated)
+        _log_way(stream, motion, road, stated_poses)
         for name in CURVES:
-            for part, text, color, width in SERIES:
+            for series, text, color, width in SERIES:
                 style = rr.SeriesLines(colors=color, widths=width, names=text)
-                stream.log(f"curves/{name}/{part}", style, static=True)
+                stream.log(f"curves/{name}/{series}", style, static=True)
         for index, stamp in enumerate(drive.stamps):
             stream.set_time(entities.FRAME_TIMELINE, sequence=stamp.index)
             stream.set_time(entities.TIME_TIMELINE, duration=(stamp.timestamp_ns - drive.stamps[0].timestamp_ns) / 1e9)
@@ -62,13 +62,13 @@ def _layout(drive: WatchedDrive, road: StitchedRoad) -> Layout:
 
 
 def _log_way(
-    stream: rr.RecordingStream, motion: MeasuredMotion, road: StitchedRoad, stated: Items[Array] | None
+    stream: rr.RecordingStream, motion: MeasuredMotion, road: StitchedRoad, stated_poses: Items[Array] | None
 ) -> None:
     """The stitched road with the whole way."""
     encoded = encode_image(road.image[..., ::-1], quality=JPEG_QUALITY)
     stream.log(f"{WAY}/road", rr.EncodedImage(contents=encoded, media_type="image/jpeg"), static=True)
-    if stated is not None:
-        moved = np.stack([inverse(stated[0]) @ pose for pose in stated])
+    if stated_poses is not None:
+        moved = np.stack([inverse(stated_poses[0]) @ pose for pose in stated_poses])
         line = rr.LineStrips2D([road.pixels(moved)], colors=STATED_COLOR, radii=rr.Radius.ui_points(2.5))
         stream.log(f"{WAY}/stated", line, static=True)
     pixels = road.pixels(motion.poses)
@@ -96,9 +96,9 @@ def _log_frame(
         return
     for name, (values, deviations) in zip(CURVES, (speeds(motion), yaw_rates_deg(motion)), strict=True):
         value, deviation = float(values[index - 1]), float(deviations[index - 1])
-        parts = {"measured": value, "low": value - deviation, "high": value + deviation}
-        for part, number in parts.items():
-            stream.log(f"curves/{name}/{part}", rr.Scalars(number))
+        numbers = {"measured": value, "low": value - deviation, "high": value + deviation}
+        for series, number in numbers.items():
+            stream.log(f"curves/{name}/{series}", rr.Scalars(number))
     if index in drive.images:
         _log_points(stream, motion.steps[index - 1].seen, drive.rig)
     reason = motion.steps[index - 1].reason

@@ -107,13 +107,13 @@ class StatedDifference:
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
 
-def against_stated(motion: MeasuredMotion, stated: Items[Array]) -> StatedDifference | None:
+def against_stated(motion: MeasuredMotion, stated_poses: Items[Array]) -> StatedDifference | None:
     """The difference to stated poses (F, 4, 4), world_from_ego; None without steps."""
     if not motion.steps:
         return None
-    steps = [inverse(a) @ b for a, b in pairwise(stated)]
+    steps = [inverse(a) @ b for a, b in pairwise(stated_poses)]
     apart = [inverse(step.ego_a_from_ego_b) @ other for step, other in zip(motion.steps, steps, strict=True)]
-    end = inverse(motion.poses[-1]) @ inverse(stated[0]) @ stated[-1]
+    end = inverse(motion.poses[-1]) @ inverse(stated_poses[0]) @ stated_poses[-1]
     return StatedDifference(
         end_m=float(np.linalg.norm(end[:3, 3])),
         end_deg=float(np.linalg.norm(_turn_deg(end))),

@@ -135,9 +135,9 @@ def _axes(steps: Array) -> Iterator[Mistake]:
         message = "the axes of the poses are not those of the ego frame"
         if is_mirrored:
             message = "the poses are left-handed" + (", or their z points down" if flat else "")
-        found = ", ".join(names[:2] if flat else names)
+        description = ", ".join(names[:2] if flat else names)
         advice = "mirror y of positions and rotations, or turn z up" if is_mirrored and flat else TURN_INTO_EGO
-        yield Mistake("motion-axes", message, found, "x forward, y left, z up", advice, undone)
+        yield Mistake("motion-axes", message, description, "x forward, y left, z up", advice, undone)
 
 
 def _position_axes(poses: Array) -> Iterator[Mistake]:
@@ -149,9 +149,9 @@ def _position_axes(poses: Array) -> Iterator[Mistake]:
         signs = ["-" if row.min() < 0 else "" for row in stated_from_world]
         held = ", ".join(sign + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
         message = "axes of the positions are swapped" if order != [0, 1, 2] else "axes of the positions are negated"
-        found = f"x, y, z of the positions hold {held} of the rotations' world"
+        description = f"x, y, z of the positions hold {held} of the rotations' world"
         yield Mistake(
-            "motion-axes", message, found, "one world frame, right-handed, z up",
+            "motion-axes", message, description, "one world frame, right-handed, z up",
             "correct the columns x, y, z, or the rotations", steps_between(undone),
         )  # fmt: skip
 

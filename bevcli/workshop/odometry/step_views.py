@@ -152,8 +152,8 @@ class StepViews:
 
     def group(self, first: Indices | int, second: Indices | int, rays_a: Array) -> Indices:
         """(n,) the groups of points with rays (n, 3) in images of a first and of a second camera."""
-        part = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
-        return np.asarray((first * self.cameras + second) * PARTS + part, dtype=np.int64)
+        sector = np.digitize(rays_a[:, 0], (-0.25, 0.25)) + 3 * (rays_a[:, 1] > 0.1)
+        return np.asarray((first * self.cameras + second) * PARTS + sector, dtype=np.int64)
 
     def of_single_cameras(self, points: EpipolarResiduals) -> EpipolarResiduals:
         """The points whose images are of the same camera."""

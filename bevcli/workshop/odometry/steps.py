@@ -81,11 +81,11 @@ def seen_points(cameras: Items[Camera], *kinds: tuple[Indices, Array, Array]) ->
     for is_road, (of, rays, residuals) in enumerate(kinds):
         for index, camera in enumerate(cameras):
             mine = np.flatnonzero(of == index)
-            chosen = mine[:: max(1, -(-len(mine) // MOST_SEEN))]
-            pixels, _ = camera.project(rays[chosen])
-            sizes = np.linalg.norm(residuals[chosen], axis=-1)
-            roads = np.full(len(chosen), bool(is_road))
-            columns.append((np.full(len(chosen), index), pixels / (camera.width, camera.height), sizes, roads))
+            selected = mine[:: max(1, -(-len(mine) // MOST_SEEN))]
+            pixels, _ = camera.project(rays[selected])
+            sizes = np.linalg.norm(residuals[selected], axis=-1)
+            roads = np.full(len(selected), bool(is_road))
+            columns.append((np.full(len(selected), index), pixels / (camera.width, camera.height), sizes, roads))
     camera_of, at, sizes, roads = (np.concatenate(column) for column in zip(*columns, strict=True))
     return SeenPoints(camera_of.astype(np.int16), at.astype(np.float32), sizes.astype(np.float32), roads)
 
@@ -204,11 +204,11 @@ def _ways(step: StepViews, points: EpipolarResiduals, state: Array) -> Array:
 
 def _peaks(votes: Array) -> list[int]:
     """The indices of the distances with most votes, most first."""
-    left, apart = votes.copy(), round(APART_M / CELL_M)
+    remaining, apart = votes.copy(), round(APART_M / CELL_M)
     peaks: list[int] = []
-    while left.max() > 0 and left.max() >= LEAST_VOTES * votes.max():
-        peaks.append(int(left.argmax()))
-        left[max(0, peaks[-1] - apart) : peaks[-1] + apart + 1] = 0
+    while remaining.max() > 0 and remaining.max() >= LEAST_VOTES * votes.max():
+        peaks.append(int(remaining.argmax()))
+        remaining[max(0, peaks[-1] - apart) : peaks[-1] + apart + 1] = 0
     return peaks
 
 
@@ -293,7 +293,7 @@ def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: 
             group = (index * step.cameras + index) * PARTS
             parts.append(road_points(camera, (a.pixels, b.pixels), geometry, group, most_px, grey=True))
             groups.append(step.group(index, index, parts[-1].rays_a))
-    columns = (np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(RoadPoints))
+    columns = (np.concatenate([getattr(points, field.name) for points in parts]) for field in fields(RoadPoints))
     road = RoadResiduals(np.concatenate(groups), *columns).sorted()
     near = road.beside_m < WAY_M
     return road.where(near) if near.sum() >= FEWEST_OF_ROAD else road  # farther aside may be a pavement: it is higher
@@ -301,9 +301,9 @@ def _road_in_images(step: StepViews, unknowns: StepUnknowns, x: Array, most_px: 
 
 def is_measured(candidate: Candidate) -> bool:
     """False where the images do not tell the motion: its deviations are those before anything was measured."""
-    turn, place = np.sqrt(np.diag(candidate.covariance)).reshape(2, 3)
+    turn, position = np.sqrt(np.diag(candidate.covariance)).reshape(2, 3)
     distance = float(np.hypot(*candidate.state[3:5]))
-    return bool(np.hypot(*place[:2]) < max(WIDEST_M, WIDEST * distance) and turn.max() < WIDEST_RAD)
+    return bool(np.hypot(*position[:2]) < max(WIDEST_M, WIDEST * distance) and turn.max() < WIDEST_RAD)
 
 
 NOT_TOLD = "the images do not tell the distance: too few points of the road match"

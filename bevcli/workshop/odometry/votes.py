@@ -39,10 +39,10 @@ def distance_votes(
         covered = cv2.boxFilter(b.seen[row : row + TILE].mean(0, dtype=np.float32)[None], -1, (TILE, 1), anchor=(0, 0))
         beside = BEGIN_M[1] + (row + TILE / 2) * CELL_M
         for column in range(0, width - TILE + 1, TILE):
-            part = np.s_[row : row + TILE, column : column + TILE]
-            if a.seen[part].mean() < LEAST_SEEN or a.texture[part].std() < LEAST_CONTRAST:
+            tile = np.s_[row : row + TILE, column : column + TILE]
+            if a.seen[tile].mean() < LEAST_SEEN or a.texture[tile].std() < LEAST_CONTRAST:
                 continue
-            alike = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[part]), cv2.TM_CCOEFF_NORMED).max(0)
+            alike = cv2.matchTemplate(strip, np.ascontiguousarray(a.texture[tile]), cv2.TM_CCOEFF_NORMED).max(0)
             at = column - shifts
             inside = (at >= 0) & (at <= last)
             usable = inside & (covered[0, at.clip(0, last)] >= LEAST_SEEN)

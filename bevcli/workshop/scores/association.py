@@ -190,8 +190,8 @@ def associate(truth: TrackedBoxes, predictions: TrackedBoxes, pairs: Pairs, thre
     memory: dict[int, int] = {}  # object -> the track that it was matched to last; objects differ between scenes
     for start, end in pairwise([*starts.tolist(), len(truths)]):
         for g, p, distance in _matches(rows[start:end], objects, tracks, memory):
-            known = memory.get(objects[g], tracks[p])
-            kinds[g] = MATCH if known == tracks[p] else SWITCH
+            last_track = memory.get(objects[g], tracks[p])
+            kinds[g] = MATCH if last_track == tracks[p] else SWITCH
             partners[g], matched_m[g] = p, distance
             memory[objects[g]] = tracks[p]
     return Association(kinds, partners, matched_m)
@@ -216,8 +216,8 @@ def _assignment(pairs: list[Pair]) -> list[Pair]:
         return pairs
     most = sum(pair[2] for pair in pairs) + 1.0  # one more pair is always worth more than shorter distances
     cost = np.full((len(rows), len(columns)), most)
-    chosen = {(rows[pair[0]], columns[pair[1]]): pair for pair in pairs}
-    for cell, (_, _, distance) in chosen.items():
+    pair_of_cell = {(rows[pair[0]], columns[pair[1]]): pair for pair in pairs}
+    for cell, (_, _, distance) in pair_of_cell.items():
         cost[cell] = distance
     cells = zip(*(indices.tolist() for indices in linear_sum_assignment(cost)), strict=True)
-    return [chosen[cell] for cell in cells if cell in chosen]
+    return [pair_of_cell[cell] for cell in cells if cell in pair_of_cell]

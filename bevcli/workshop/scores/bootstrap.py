@@ -52,8 +52,8 @@ def _resampled_class(
         copies, truth_count = drawn[predictions.frames], int(drawn[truth_frames].sum())
         aps, means = _score(copies, scores, hits, of_hits, truth_count, config.error_row, limits, RECALLS)
         by_distance = dict(zip(config.distances_m, aps.tolist(), strict=True))
-        known = dict(zip(defined, means.tolist(), strict=True))
-        yield ClassScores(truth_count, len(scores), np.nan, by_distance, unknown | known, {})
+        measured = dict(zip(defined, means.tolist(), strict=True))
+        yield ClassScores(truth_count, len(scores), np.nan, by_distance, unknown | measured, {})
 
 
 @njit(nogil=True)
@@ -79,22 +79,22 @@ def _score(copies, scores, hits, errors, truth_count, error_row, limits, recalls
 def _curve(copies, seen, scores, hits, truth_count, recalls):  # type: ignore[no-untyped-def]
     """Precision and score at the recalls (101,) each: between two true positives, those before and at the second."""
     precision, at = np.zeros(len(recalls)), np.zeros(len(recalls))
-    found, index = 0, 0
+    hit_count, index = 0, 0
     for hit in hits:
         for copy in range(copies[hit]):
             before = seen[hit] - copies[hit] + copy  # predictions
             last_precision, last_score = 1.0, scores[hit]  # where the curve begins
             if before:
-                last_precision, last_score = found / before, scores[hit if copy else _last(copies, hit)]
-            start, end, new = found / truth_count, (found + 1) / truth_count, (found + 1) / (before + 1)
+                last_precision, last_score = hit_count / before, scores[hit if copy else _last(copies, hit)]
+            start, end, new = hit_count / truth_count, (hit_count + 1) / truth_count, (hit_count + 1) / (before + 1)
             while index < len(recalls) and recalls[index] < end:
                 share = (recalls[index] - start) / (end - start)
                 precision[index] = last_precision + share * (new - last_precision)
                 at[index] = last_score + share * (scores[hit] - last_score)
                 index += 1
-            found += 1
-    if found and index < len(recalls) and recalls[index] == found / truth_count:
-        precision[index], at[index] = found / seen[-1], scores[_last(copies, len(copies))]
+            hit_count += 1
+    if hit_count and index < len(recalls) and recalls[index] == hit_count / truth_count:
+        precision[index], at[index] = hit_count / seen[-1], scores[_last(copies, len(copies))]
     return precision, at
 
 
@@ -111,25 +111,25 @@ def _last(copies, end):  # type: ignore[no-untyped-def]
 def _mean_error(copies, scores, hits, errors, at, first):  # type: ignore[no-untyped-def]
     """The running mean of an error at the scores of the recalls `at`, averaged over the recalls that are reached."""
     last = 0
-    for place in range(len(at)):
-        if at[place] != 0:
-            last = place
+    for recall in range(len(at)):
+        if at[recall] != 0:
+            last = recall
     if last < first:
         return 1.0
-    place, reached, known, total, mean, result = first, 0, 0, 0.0, 0.0, 0.0
+    recall, reached, error_count, total, mean, result = first, 0, 0, 0.0, 0.0, 0.0
     last_score, last_mean = 0.0, 0.0
     for index, hit in enumerate(hits):
         for _ in range(copies[hit]):
             if not np.isnan(errors[index]):
-                known, total = known + 1, total + errors[index]
-            mean, reached = total / known if known else 0.0, reached + 1
-            while place <= last and at[place] >= scores[hit]:
-                if reached > 1 and at[place] > scores[hit]:
-                    share = (last_score - at[place]) / (last_score - scores[hit])
+                error_count, total = error_count + 1, total + errors[index]
+            mean, reached = total / error_count if error_count else 0.0, reached + 1
+            while recall <= last and at[recall] >= scores[hit]:
+                if reached > 1 and at[recall] > scores[hit]:
+                    share = (last_score - at[recall]) / (last_score - scores[hit])
                     result += last_mean + share * (mean - last_mean)
                 else:
                     result += mean
-                place += 1
+                recall += 1
             last_score, last_mean = scores[hit], mean
-    result += (last - place + 1) * mean  # recalls with a lower score than the last true positive
-    return result / (last - first + 1) if known else 1.0
+    result += (last - recall + 1) * mean  # recalls with a lower score than the last true positive
+    return result / (last - first + 1) if error_count else 1.0

@@ -95,11 +95,11 @@ class Comparison:
     def table(self) -> str:
         """The differences and the worst frames as text for a terminal."""
         first = self.scores[0]
-        boxes = {name: each.ground_truth_count for name, each in first.detection.overall.classes.items()}
+        boxes = {name: item.ground_truth_count for name, item in first.detection.overall.classes.items()}
         rows: list[tuple[str, ...]] = [
             ("class", "boxes", "AP A", "AP B", "B - A", f"{100 * CONFIDENCE:.0f} % interval", "better")
         ]
-        rows += [_row(name, str(boxes[name]), each) for name, each in self.classes.items() if boxes[name]]
+        rows += [_row(name, str(boxes[name]), item) for name, item in self.classes.items() if boxes[name]]
         rows += [_row("mAP", str(sum(boxes.values())), self.mean_ap), _row("NDS", "", self.nd_score)]
         files = [f"{model}: {file}" for model, file in zip(MODELS, self.files, strict=True)]
         frames = counted(first.detection.frame_count, "frames")

@@ -296,8 +296,8 @@ def _model_range_m(
     predictions: inputs.ScoredInput, pairs: inputs.FramePairs, classes: Mapping[str, ObjectClass]
 ) -> float | None:
     """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
-    stated, farthest = predictions.range_m, max(kind.range_m for kind in classes.values())
-    return stated if pairs.ego_pose_known and stated is not None and stated < farthest else None
+    range_m, farthest = predictions.range_m, max(object_class.range_m for object_class in classes.values())
+    return range_m if pairs.ego_pose_known and range_m is not None and range_m < farthest else None
 
 
 def _class_notes(

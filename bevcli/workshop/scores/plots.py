@@ -205,21 +205,21 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
 def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes]) -> list[Line2D]:
     colors = plot_colors(missed)
     dots = [
-        Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(part)} / {len(false[name])}")
-        for name, part in missed.items()
+        Line2D([], [], color=colors[name], marker="o", ls="", label=f"{name} {len(boxes)} / {len(false[name])}")
+        for name, boxes in missed.items()
     ]
     return dots + [Line2D([], [], color=color, label=label) for label, (color, _) in _OUTLINES.items()]
 
 
 def _radius(detection: DetectionScores) -> float:
     """The radius that is drawn, metres: that of the farthest box, at most 100."""
-    ranges = [part.ranges_m for match in detection.matches for part in (match.ground_truth, match.predictions)]
+    ranges = [boxes.ranges_m for match in detection.matches for boxes in (match.ground_truth, match.predictions)]
     farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
     return min(10 * np.ceil(farthest / 10), 100.0)
 
 
 def _worst_frames(outcomes: Iterable[Outcome]) -> list[int]:
-    mistakes = [part.frames for outcome in outcomes for part in (outcome.missed, outcome.false)]
+    mistakes = [boxes.frames for outcome in outcomes for boxes in (outcome.missed, outcome.false)]
     counts = Counter(np.concatenate(mistakes).tolist())
     return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
 
@@ -228,11 +228,11 @@ def _draw_dots(
     axes: Axes, title: str, parts: Mapping[str, ScoredBoxes], reference_from_ego: Array, radius: float
 ) -> None:
     centers_ego, colors, of_class = [np.zeros((0, 3))], [], plot_colors(parts)
-    for name, part in parts.items():
-        ego_from_reference = inverse(reference_from_ego)[part.frames]
-        turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], part.boxes.centers)
+    for name, scored in parts.items():
+        ego_from_reference = inverse(reference_from_ego)[scored.frames]
+        turned = np.einsum("nij,nj->ni", ego_from_reference[:, :3, :3], scored.boxes.centers)
         centers_ego.append(turned + ego_from_reference[:, :3, 3])
-        colors += [of_class[name]] * len(part)
+        colors += [of_class[name]] * len(scored)
     points = _in_plot(np.concatenate(centers_ego))
     # A random subset in random order, so that no class hides another.
     shown = np.random.default_rng(0).permutation(len(points))[:MAX_DOTS]
@@ -247,18 +247,18 @@ def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[Outcome], pairs: Fram
     ego_from_reference = inverse(pairs.reference_from_ego[frame])
     counts = np.zeros(3, dtype=int)
     for outcome in outcomes:
-        parts = [part[part.frames == frame] for part in outcome]
-        for part, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
-            _draw_boxes(axes, part, ego_from_reference, color, style)
-        counts += [len(part) for part in parts]
+        parts = [scored[scored.frames == frame] for scored in outcome]
+        for scored, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
+            _draw_boxes(axes, scored, ego_from_reference, color, style)
+        counts += [len(scored) for scored in parts]
     _draw_ground(axes, radius)
     stamp = pairs.ground_truth[frame].stamp
     scene = f"{stamp.scene} " if stamp.scene else ""
     axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
 
 
-def _draw_boxes(axes: Axes, part: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
-    outlines = [_in_plot(apply(ego_from_reference, corners[:4])) for corners in part.boxes.corners()]
+def _draw_boxes(axes: Axes, scored: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
+    outlines = [_in_plot(apply(ego_from_reference, corners[:4])) for corners in scored.boxes.corners()]
     closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
     axes.add_collection(LineCollection(closed, colors=color, linestyles=style, linewidths=1.3, zorder=3))
 

@@ -336,7 +336,7 @@ def _require_identities(
 
 
 def _over_classes(name: str, values: Sequence[float]) -> float:
-    known = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
-    if not len(known):
+    defined = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
+    if not len(defined):
         return np.nan
-    return float(known.sum() if name in SUMMED else known.mean())
+    return float(defined.sum() if name in SUMMED else defined.mean())

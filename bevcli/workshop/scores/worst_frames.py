@@ -70,9 +70,9 @@ class WorstFrames:
         if len(self.missed) == 1:
             return {"missed": self._largest(self.missed[0]), "invented": self._largest(self.invented[0])}
         lists = {
-            f"{model.lower()}_{kind}": self._largest(counts[index])
+            f"{model.lower()}_{mistake}": self._largest(counts[index])
             for index, model in enumerate(MODELS)
-            for kind, counts in (("missed", self.missed), ("invented", self.invented))
+            for mistake, counts in (("missed", self.missed), ("invented", self.invented))
         }
         mistakes = self.missed + self.invented
         return {"difference": self._largest(abs(mistakes[0] - mistakes[1])), **lists}
@@ -114,7 +114,7 @@ class WorstFrames:
 
     def _columns(self) -> list[str]:
         models = ("",) if len(self.missed) == 1 else tuple(f"{model} " for model in MODELS)
-        return [f"{model}{kind}" for model in models for kind in ("missed", "invented")]
+        return [f"{model}{mistake}" for model in models for mistake in ("missed", "invented")]
 
     def _counts(self, index: int) -> list[int]:
         pairs = zip(self.missed[:, index].tolist(), self.invented[:, index].tolist(), strict=True)
@@ -137,8 +137,8 @@ class WorstFrames:
 
 def _heading(name: str) -> str:
     """Such as "most missed", "A most missed" and "largest difference"."""
-    *model, kind = name.split("_")
-    return "largest difference" if kind == "difference" else " ".join([*map(str.upper, model), "most", kind])
+    *model, mistake = name.split("_")
+    return "largest difference" if mistake == "difference" else " ".join([*map(str.upper, model), "most", mistake])
 
 
 def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
@@ -165,7 +165,7 @@ def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
 
 def _by_frame(parts: Sequence[ScoredBoxes], frame_count: int) -> NDArray[np.int64]:
     """(F,), number of boxes."""
-    return np.bincount(np.concatenate([part.frames for part in parts]), minlength=frame_count)
+    return np.bincount(np.concatenate([boxes.frames for boxes in parts]), minlength=frame_count)
 
 
 def _command(models: Sequence[Compared]) -> tuple[str, ...]:

@@ -372,9 +372,9 @@ def _inside(x: Tensor) -> Tensor:
 
 def _convolved(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
     """(M, 3, H, W) of which some are mixed with a random convolution that keeps their contrast."""
-    chosen = _chosen(len(x), config.convolution, generator)
-    sizes = torch.randint(len(KERNEL_SIZES), (len(chosen),), generator=generator)
-    shares = torch.rand(len(chosen), 1, 1, 1, generator=generator)
+    selected = _random_indices(len(x), config.convolution, generator)
+    sizes = torch.randint(len(KERNEL_SIZES), (len(selected),), generator=generator)
+    shares = torch.rand(len(selected), 1, 1, 1, generator=generator)
     y = x.clone()
     for index_of_size, size in enumerate(KERNEL_SIZES):
         of_size = (sizes == index_of_size).nonzero()[:, 0]
@@ -382,12 +382,12 @@ def _convolved(x: Tensor, config: RandomisationConfig, generator: torch.Generato
         if not count:
             continue
         weights = torch.randn(3 * count, 3, size, size, generator=generator)
-        index, share = upload(chosen[of_size], x.device), upload(shares[of_size], x.device)
-        part = x[index]
-        z = F.conv2d(part.flatten(0, 1)[None], upload(weights, x.device), padding=size // 2, groups=count)
-        z = z.view_as(part)
-        contrast = (part.std(dim=(1, 2, 3)) + 1e-3) / (z.std(dim=(1, 2, 3)) + 1e-3)
-        y[index] = torch.lerp(z * contrast[:, None, None, None], part, share)
+        index, share = upload(selected[of_size], x.device), upload(shares[of_size], x.device)
+        images = x[index]
+        z = F.conv2d(images.flatten(0, 1)[None], upload(weights, x.device), padding=size // 2, groups=count)
+        z = z.view_as(images)
+        contrast = (images.std(dim=(1, 2, 3)) + 1e-3) / (z.std(dim=(1, 2, 3)) + 1e-3)
+        y[index] = torch.lerp(z * contrast[:, None, None, None], images, share)
     return y
 
 
@@ -414,21 +414,21 @@ def _recolored(x: Tensor, config: RandomisationConfig, image: ImageConfig, gener
 
 
 def _blurred(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
-    index = upload(_chosen(len(x), config.blur, generator), x.device)
+    index = upload(_random_indices(len(x), config.blur, generator), x.device)
     return x.index_copy(0, index, F.avg_pool2d(x[index], 3, 1, padding=1, count_include_pad=False))
 
 
 def _noisy(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:
-    chosen = _chosen(len(x), config.noise, generator)
+    selected = _random_indices(len(x), config.noise, generator)
     low, high = NOISE_RANGE
-    deviation = low + (high - low) * torch.rand(len(chosen), 1, 1, 1, generator=generator)
+    deviation = low + (high - low) * torch.rand(len(selected), 1, 1, 1, generator=generator)
     deviation = deviation / torch.tensor(image.std)[:, None, None]  # (K, 3, 1, 1)
     seed = int(torch.randint(2**62, (), generator=generator))
     of_device = torch.Generator(x.device).manual_seed(seed)
-    noise = torch.randn(len(chosen), *x.shape[1:], generator=of_device, device=x.device)
-    return x.index_add(0, upload(chosen, x.device), noise * upload(deviation, x.device))
+    noise = torch.randn(len(selected), *x.shape[1:], generator=of_device, device=x.device)
+    return x.index_add(0, upload(selected, x.device), noise * upload(deviation, x.device))
 
 
-def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
+def _random_indices(count: int, share: float, generator: torch.Generator) -> Tensor:
     """Indices of images, each chosen with a probability."""
     return (torch.rand(count, generator=generator) < share).nonzero()[:, 0]

@@ -147,10 +147,10 @@ def assigned_loss(
         truth: of B frames.
         objects: (..., B, Q) int64, the object of each query, -1 for none.
     """
-    assigned, chosen = objects >= 0, objects.clamp(min=0)
+    assigned, object_index = objects >= 0, objects.clamp(min=0)
     leading = objects.shape[:-2]
-    labels = truth.labels.expand(*leading, -1, -1).gather(-1, chosen)  # (..., B, Q)
-    index = chosen[..., None].expand(*chosen.shape, box_codes.shape[-1])
+    labels = truth.labels.expand(*leading, -1, -1).gather(-1, object_index)  # (..., B, Q)
+    index = object_index[..., None].expand(*object_index.shape, box_codes.shape[-1])
     codes = truth.codes.expand(*leading, -1, -1, -1).gather(-2, index)  # (..., B, Q, 10)
     qualities = qualities_of(box_codes, codes, config.quality_m) * assigned
     class_targets = torch.zeros_like(class_logits).scatter_(-1, labels[..., None], qualities[..., None])
@@ -171,8 +171,8 @@ def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: Detec
 
     predicted and truth: (..., 10).
     """
-    known = (assigned & truth.isfinite().all(-1))[..., None]
-    predicted, truth = predicted.where(known, 0), truth.where(known, 0)
+    is_compared = (assigned & truth.isfinite().all(-1))[..., None]
+    predicted, truth = predicted.where(is_compared, 0), truth.where(is_compared, 0)
     errors = F.l1_loss(predicted, truth, reduction="none")  # (..., 10)
     moving = truth[..., VELOCITY_START:].norm(dim=-1) >= MIN_MOVING_MPS
     weights = config.velocity_weight * torch.where(moving, config.moving_weight, 1.0)
@@ -290,12 +290,12 @@ def segmentation_loss(
     of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
     classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
 
-    logits = _chosen(outputs.mask_logits, queries)  # (M, B, G, Y·X)
+    logits = _of_queries(outputs.mask_logits, queries)  # (M, B, G, Y·X)
     logits = torch.cat([outputs.mask_logits[:, :, :first], logits], 2)
     masks = torch.cat([truth.stuff, truth.things], 1).expand_as(logits)
     losses = config.dice_weight * dice_loss(logits, masks)
     losses = (losses + config.pixel_weight * focal_loss(logits, masks).mean(-1)) * assigned
-    errors = (_chosen(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
+    errors = (_of_queries(outputs.locations, queries - first) - truth.locations).abs().sum(-1) * of_things
     return {
         "map classes": config.class_weight * classes,
         "masks": losses[..., :first].sum() / stuff + losses[..., first:].sum() / things,
@@ -303,7 +303,7 @@ def segmentation_loss(
     }
 
 
-def _chosen(tensor: Tensor, queries: Tensor) -> Tensor:
+def _of_queries(tensor: Tensor, queries: Tensor) -> Tensor:
     """(M, B, Q, ...) -> (M, B, G, ...), those of the queries (B, G)."""
     index = queries[None, ..., None].expand(len(tensor), -1, -1, tensor.shape[-1])
     return tensor.gather(2, index)

@@ -173,7 +173,7 @@ def rigs_of(rigs: Iterable[CameraRig]) -> dict[str, Any]:
     }
 
 
-def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
+def model_table(name: str, preset: Preset, data: DataFacts) -> dict[str, Any]:
     """The contents of a model's file for a data set.
 
     The number of BEV cells and all layers are those of the preset's model, so that its weights fit, except those of
@@ -183,31 +183,31 @@ def model_table(name: str, preset: Preset, facts: DataFacts) -> dict[str, Any]:
     table = copy.deepcopy(read_model_file(model)[0])
     for path, changes in changes_by_table.items():
         _change(table, path, changes)
-    official = [label for label in NUSCENES_CLASSES if label in facts.class_counts]
-    further = [label for label in facts.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
-    table |= {"name": name, "classes": official + further, "cameras": list(facts.cameras)}
+    official = [label for label in NUSCENES_CLASSES if label in data.class_counts]
+    further = [label for label in data.class_counts if label not in NUSCENES_CLASSES]  # the most frequent first
+    table |= {"name": name, "classes": official + further, "cameras": list(data.cameras)}
     if further:
-        table["class_settings"] = {name: {"like": class_of_size(*facts.class_sizes[name])} for name in further}
-    table["rate_hz"] = rate_for(facts, table.get("rate_hz", 2.0))
+        table["class_settings"] = {name: {"like": class_of_size(*data.class_sizes[name])} for name in further}
+    table["rate_hz"] = rate_for(data, table.get("rate_hz", 2.0))
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
-    table["image"]["size"] = _image_size(facts, table["image"]["size"][0])
-    _set_range(table["bev_grid"], facts)
-    table["training_rigs"] = rigs_of(facts.rigs)
-    if facts.map_reach_m < table["bev_grid"]["x_range_m"][1]:
+    table["image"]["size"] = _image_size(data, table["image"]["size"][0])
+    _set_range(table["bev_grid"], data)
+    table["training_rigs"] = rigs_of(data.rigs)
+    if data.map_reach_m < table["bev_grid"]["x_range_m"][1]:
         table["heads"] = ["detection"]
         table.pop("segmentation", None)
     training = table.setdefault(TRAINING, {})
     training.pop("rigs", None)  # of rendered drives
     training["freeze_batch_norm"] = True  # a few small batches of other images would spoil the statistics
-    training["held_out"] = 0 if len(facts.drives) == 1 else min(LARGEST_HELD_OUT, max(1, len(facts.drives) // 5))
+    training["held_out"] = 0 if len(data.drives) == 1 else min(LARGEST_HELD_OUT, max(1, len(data.drives) // 5))
     clips = training.setdefault("clips", {})
-    clips["frames"] = min(clips.get("frames", TrainingConfig().clips.frames), facts.shortest(table["rate_hz"]))
+    clips["frames"] = min(clips.get("frames", TrainingConfig().clips.frames), data.shortest(table["rate_hz"]))
     return table
 
 
-def rate_for(facts: DataFacts, preset_hz: float) -> float:
+def rate_for(data: DataFacts, preset_hz: float) -> float:
     """The frame rate to train at: the preset's, or that of data with fewer frames."""
-    return preset_hz if facts.rate_hz >= NEAREST_RATE * preset_hz else float(f"{facts.rate_hz:.2g}")
+    return preset_hz if data.rate_hz >= NEAREST_RATE * preset_hz else float(f"{data.rate_hz:.2g}")
 
 
 def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> None:
@@ -220,18 +220,18 @@ def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> Non
             table[key] = value
 
 
-def _image_size(facts: DataFacts, width_px: int) -> list[int]:
+def _image_size(data: DataFacts, width_px: int) -> list[int]:
     """The preset's width, or that of smaller images, with the data's aspect ratio."""
-    width, height = facts.image_size
+    width, height = data.image_size
     size = min(width_px, width)
     return [size, max(1, round(size * height / width))]
 
 
-def _set_range(grid: dict[str, Any], facts: DataFacts) -> None:
+def _set_range(grid: dict[str, Any], data: DataFacts) -> None:
     """A square of whole metres that holds most boxes, with as many cells as before; a higher one if it is needed."""
-    half = float(max(4, math.ceil(round(facts.reach_m, 3))))
+    half = float(max(4, math.ceil(round(data.reach_m, 3))))
     grid["x_range_m"] = grid["y_range_m"] = [-half, half]
-    low, high = np.percentile(facts.centers_bev[:, 2], (1, 99))
+    low, high = np.percentile(data.centers_bev[:, 2], (1, 99))
     z0, z1 = grid["z_range_m"]
     grid["z_range_m"] = [float(min(z0, math.floor(low))), float(max(z1, math.ceil(high)))]
 
@@ -311,24 +311,24 @@ def _open_drives(data: DriveOptions) -> list[Drive]:
     return [open_sequence(folder, options) for folder in folders]
 
 
-def _facts_lines(facts: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
+def _facts_lines(data: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
     """The facts that the settings of the file follow from."""
-    named = ", ".join(f"{name} {facts.class_counts[name]}" for name in table["classes"])
-    yield f"Boxes in {counted(facts.frames, 'frames')}: {named}."
+    named = ", ".join(f"{name} {data.class_counts[name]}" for name in table["classes"])
+    yield f"Boxes in {counted(data.frames, 'frames')}: {named}."
     alike = ", ".join(f"{name} like {settings['like']}" for name, settings in table.get("class_settings", {}).items())
     if alike:
         yield f"Own classes, by the sizes of their boxes: {alike}; [class_settings] changes it."
-    counts = sorted({len(rig.cameras) for rig in facts.rigs})
+    counts = sorted({len(rig.cameras) for rig in data.rigs})
     number = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
-    sizes = [" x ".join(map(str, size)) for size in (facts.image_size, table["image"]["size"])]
+    sizes = [" x ".join(map(str, size)) for size in (data.image_size, table["image"]["size"])]
     yield f"Cameras: {number}, images of {sizes[0]}, used at {sizes[1]}."
-    yield f"Frames per second: {facts.rate_hz:.3g}, used at {table['rate_hz']:g}."
+    yield f"Frames per second: {data.rate_hz:.3g}, used at {table['rate_hz']:g}."
     grid = table["bev_grid"]
     half = grid["x_range_m"][1]
     cells = f"{grid['columns']} x {grid['rows']} BEV cells of {2 * half / grid['columns']:.2f} m"
-    yield f"{INSIDE_PERCENT:g} % of the boxes are within {facts.reach_m:.1f} m ahead and to the sides: {cells}."
-    if 0 < facts.map_reach_m < half:
-        yield f"Maps reach {facts.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
+    yield f"{INSIDE_PERCENT:g} % of the boxes are within {data.reach_m:.1f} m ahead and to the sides: {cells}."
+    if 0 < data.map_reach_m < half:
+        yield f"Maps reach {data.map_reach_m:g} m only, less than the grid: the model has no segmentation head."
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,9 @@ def train(model: str | Path, *, device: str = "auto", **options: Any) -> Path:
         WeightsError: the weights to start from cannot be read or do not fit.
         OutputError: the folder holds another training, is in use, or cannot be written.
     """
-    chosen, drives, left = spread(options, TrainOptions, DriveOptions)
-    refuse(left, "train", TrainOptions, DriveOptions)
-    with training(str(model), drives, chosen, device) as trainer:
+    train_options, drives, unknown = spread(options, TrainOptions, DriveOptions)
+    refuse(unknown, "train", TrainOptions, DriveOptions)
+    with training(str(model), drives, train_options, device) as trainer:
         for _ in trainer.run():
             pass
     return trainer.job.out / WEIGHTS
@@ -90,16 +90,16 @@ def validate(
     Raises InputError for a drive that cannot be read or has no ground truth, and what `load_model` raises.
     """
     of_model = () if isinstance(model, Model) else (ModelOptions,)
-    drives, chosen, *model_options, left = spread(options, DriveOptions, ValidationOptions, *of_model)
-    refuse(left, "validate", DriveOptions, ValidationOptions, *of_model)
+    drives, settings, *model_options, unknown = spread(options, DriveOptions, ValidationOptions, *of_model)
+    refuse(unknown, "validate", DriveOptions, ValidationOptions, *of_model)
     loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
     name = loaded.name if model is None or isinstance(model, Model) else str(model)
-    scored: Drives = deque[Any](drives_to_score(loaded.config, name, drives, chosen), maxlen=1).pop()
+    scored: Drives = deque[Any](drives_to_score(loaded.config, name, drives, settings), maxlen=1).pop()
     notes = check_scored_drives(drives, scored, loaded.config)
     if loaded.needs_export:
         loaded = loaded.in_engine(scored.open(0).rig, scored.open(0))
-    runner = loaded.runner(StepOptions(track=chosen.tracking, temporal=temporal))
-    return replace(validate_runner(runner, scored, chosen.max_range, each_drive=chosen.each), notes=notes)
+    runner = loaded.runner(StepOptions(track=settings.tracking, temporal=temporal))
+    return replace(validate_runner(runner, scored, settings.max_range, each_drive=settings.each), notes=notes)
 
 
 def drives_to_score(

@@ -132,8 +132,8 @@ class Trainer:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
             if self.done > job.config.steps:
                 limit = f"at most `steps={job.config.steps}` (`--steps {job.config.steps}`)"
-                stated = f"has done {self.done} steps already (expected {limit})"
-                raise InputError(f"{job.out}: {stated}")
+                problem = f"has done {self.done} steps already (expected {limit})"
+                raise InputError(f"{job.out}: {problem}")
         choose_training_kernels(job.model, job.device)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None

@@ -89,13 +89,13 @@ class NamedRows:
     starts: Starts
     remark: str = ""
 
-    def fit(self, rows: Tensor, own: Tensor) -> bool:
+    def fit(self, rows: Tensor, tensor: Tensor) -> bool:
         """The file names the rows of its tensor, and they have the size of the model's."""
-        return len(rows) == len(self.source) and rows.shape[1:] == own.shape[1:]
+        return len(rows) == len(self.source) and rows.shape[1:] == tensor.shape[1:]
 
-    def filled(self, rows: Tensor, own: Tensor) -> Tensor:
+    def filled(self, rows: Tensor, tensor: Tensor) -> Tensor:
         """The model's tensor, with the rows that the file has for its names."""
-        filled = own.clone()
+        filled = tensor.clone()
         for index, origins in enumerate(self.starts.values()):
             if origins:
                 filled[index] = rows[[self.source.index(name) for name in origins]].float().mean(0)
@@ -146,14 +146,14 @@ def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> W
     model_state = model.state_dict()
     for key, tensor in state.items():
         if key not in model_state:
-            start.count("unused", _part(key), "not in the model", tensor.numel(), key)
+            start.count("unused", _network_part(key), "not in the model", tensor.numel(), key)
         elif key in rows and rows[key].fit(tensor, model_state[key]):
             rows[key].count(start, model_state[key][0].numel())
             model_state[key] = rows[key].filled(tensor, model_state[key])
         else:
             model_state[key] = _whole(start, key, tensor, model_state[key], reasons.get(key, ""))
     for key in (key for key in model_state if key not in state):
-        start.count("new", _part(key), "not in the file", model_state[key].numel(), key)
+        start.count("new", _network_part(key), "not in the file", model_state[key].numel(), key)
     if start.share < LEAST_SHARE:
         of = f"model {start.source}" if start.source else "an unknown model"
         raise WeightsError(
@@ -167,15 +167,15 @@ def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> W
 def _whole(start: WarmStart, key: str, tensor: Tensor, initial: Tensor, reason: str) -> Tensor:
     """A tensor of the file if it has the model's shape, or else the model's. reason: for the line of a loaded one."""
     if tensor.shape == initial.shape:
-        start.count("loaded", _part(key), reason, initial.numel())
+        start.count("loaded", _network_part(key), reason, initial.numel())
         return tensor
     shapes = f"{key}: {_shape(tensor)} and {_shape(initial)}"
-    start.count("new", _part(key), "another shape in the file", initial.numel(), shapes)
-    start.count("unused", _part(key), "another shape in the model", tensor.numel())
+    start.count("new", _network_part(key), "another shape in the file", initial.numel(), shapes)
+    start.count("unused", _network_part(key), "another shape in the model", tensor.numel())
     return initial
 
 
-def _part(key: str) -> str:
+def _network_part(key: str) -> str:
     return key.partition(".")[0]
 
 
@@ -203,7 +203,7 @@ def _class_keys(model: Network) -> list[str]:
         f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
         for branch, modules in model.detection_head.class_branches.named_children()
     ]
-    return [f"{layer}.{kind}" for layer in layers for kind in ("weight", "bias")]
+    return [f"{layer}.{parameter}" for layer in layers for parameter in ("weight", "bias")]
 
 
 def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes", "cameras"]) -> tuple[str, ...]:

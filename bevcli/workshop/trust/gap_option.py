@@ -5,7 +5,7 @@ Measured where the weights were trained on rendered streets, which are those of 
 
 import textwrap
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,12 +55,12 @@ SLOWER = 1.5  # an image rate that is lower by this factor than the model's is a
 
 
 def gap_of_rigs(
-    check: CalibrationCheck, model: str, against: Path | None, open_drive: Callable[..., Drive]
+    check: CalibrationCheck, model: str, against: Path | None, drive: Drive | None
 ) -> "MeasuredGap | RuledGap":
     """The gap between a rig, or two, and the rigs that a model's weights know.
 
-    check: of the rig. model: a name or a FILE.toml. against: a calibration or a drive with the second rig. open_drive:
-    opens the drive of the first one; raises InputError for a calibration alone.
+    check: of the rig. model: a name or a FILE.toml. against: a calibration or a drive with the second rig. drive: of
+    the first one; None for a calibration alone.
     Raises InputError where the second rig has errors, or a rig cannot be rendered.
     """
     config = load_config(model)
@@ -74,7 +74,7 @@ def gap_of_rigs(
         rigs[other.name if other.name != check.name else f"{other.name} (second)"] = other.rig
     known, range_m = known_rigs(config), config.bev_grid.nearest_side_m
     found = {name: list(rig_differences(rig, known, range_m)) for name, rig in rigs.items()}
-    found[check.name] += of_drive(open_drive, config)
+    found[check.name] += () if drive is None else of_drive(drive, config)
     if bundled_weights(model) is None:
         for name, rig in rigs.items():
             found[name] += size_differences(rig, config) if not config.training_rigs.known else ()
@@ -82,12 +82,8 @@ def gap_of_rigs(
     return _measured(model, rigs, found, known)
 
 
-def of_drive(open_drive: Callable[..., Drive], config: ModelConfig) -> Iterator[RigDifference]:
-    """The differences of a drive's images from rendered ones: rate and light; none of a calibration alone."""
-    try:
-        drive = open_drive(ego_motion="optional")
-    except InputError:  # a calibration alone
-        return
+def of_drive(drive: Drive, config: ModelConfig) -> Iterator[RigDifference]:
+    """The differences of a drive's images from rendered ones: rate and light."""
     times = np.array([stamp.timestamp_ns for stamp in drive.stamps]) / 1e9
     steps = np.diff(times)[np.diff(times) > 0]
     if len(steps) and (every := float(np.median(steps)) * config.rate_hz) >= SLOWER:

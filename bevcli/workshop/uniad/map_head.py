@@ -309,7 +309,7 @@ class MaskLayer(nn.Module):
             attended, _ = self.self_attention(query, query, query, need_weights=False)
             query = self.self_attention_norm(query + attended)
         queries = split_heads(self.query_projection(query), self.heads)
-        keys, values = (split_heads(part(cells), self.heads) for part in (self.key_projection, self.value_projection))
+        keys, values = (split_heads(layer(cells), self.heads) for layer in (self.key_projection, self.value_projection))
         attended = F.scaled_dot_product_attention(queries, keys, values)  # (B, heads, Q, C / heads)
         query = self.norms[0](query + self.output_projection(attended.transpose(1, 2).flatten(2)))
         return self.norms[1](query + self.feed_forward(query))
@@ -330,8 +330,8 @@ class MaskProjection(nn.Module):
         """query: (B, Q, C), cells: (B, Y·X, C) -> masks (B, Q, Y·X), 0 or larger."""
         queries = split_heads(self.query_projection(query), self.heads)
         keys = split_heads(self.key_projection(cells), self.heads).transpose(-1, -2)  # (B, heads, C / heads, Y·X)
-        parts = (part @ keys / math.sqrt(part.shape[-1]) for part in queries.split(QUERIES_AT_ONCE, dim=2))
-        return torch.cat([self._masks(part) for part in parts], dim=1)
+        chunks = (chunk @ keys / math.sqrt(chunk.shape[-1]) for chunk in queries.split(QUERIES_AT_ONCE, dim=2))
+        return torch.cat([self._masks(chunk) for chunk in chunks], dim=1)
 
     def _masks(self, attention: Tensor) -> Tensor:
         """attention: (B, heads, q, Y·X) -> (B, q, Y·X)."""

@@ -150,7 +150,7 @@ def with_tracks(
     reference_points = torch.cat([places, heights[:, None]], dim=-1)
     kept = (tracks.position, tracks.content, reference_points)
     fresh = (learned.position, learned.content, learned.reference_points)
-    return ObjectQueries(*(torch.cat([one, other[None]], dim=1) for one, other in zip(fresh, kept, strict=True)))
+    return ObjectQueries(*(torch.cat([new, old[None]], dim=1) for new, old in zip(fresh, kept, strict=True)))
 
 
 def expected_centers(box_codes: Tensor, motion: FrameMotion) -> Tensor:

@@ -125,7 +125,7 @@ def true_positives(scores: Array, similarities: Array, limit: float) -> NDArray[
 
 
 def _curves(lines: MapLines, name: str) -> list[_Curve]:
-    return [_Curve(line[:, :2]) for line, kind in zip(lines.points, lines.classes, strict=True) if kind == name]
+    return [_Curve(line[:, :2]) for line, label in zip(lines.points, lines.classes, strict=True) if label == name]
 
 
 def _scores(lines: MapLines, name: str) -> Array:
@@ -220,19 +220,19 @@ def _count(predicted: Boxes3D, truth: Boxes3D, matches: NDArray[np.int64], sums:
             continue
         assert truth.futures is not None
         way = truth.futures[index, 0, :, 1:]  # (T, 2)
-        known = int(np.isfinite(way).all(-1).sum())
-        of_class.truths += known == len(way)
-        if matches[index] >= 0 and known:
+        steps = int(np.isfinite(way).all(-1).sum())
+        of_class.truths += steps == len(way)
+        if matches[index] >= 0 and steps:
             assert predicted.futures is not None
-            _add(of_class, predicted.futures[matches[index], ..., 1:], way, known)
+            _add(of_class, predicted.futures[matches[index], ..., 1:], way, steps)
 
 
-def _add(sums: MotionSums, modes: np.ndarray, way: np.ndarray, known: int) -> None:
-    """Count a matched object. modes: (M, T, 2). way: (T, 2), of which the first `known` places are compared."""
-    distance = np.linalg.norm(modes[:, :known] - way[:known], axis=-1)  # (M, known)
+def _add(sums: MotionSums, modes: np.ndarray, way: np.ndarray, steps: int) -> None:
+    """Count a matched object. modes: (M, T, 2). way: (T, 2), of which the first `steps` positions are compared."""
+    distance = np.linalg.norm(modes[:, :steps] - way[:steps], axis=-1)  # (M, steps)
     sums.ade_m += float(distance.mean(1).min())
     sums.ade_count += 1
-    if known == len(way):
+    if steps == len(way):
         last = float(distance[:, -1].min())
         sums.fde_m += last
         sums.hits += last <= HIT_M

@@ -42,10 +42,10 @@ class FramesByTime:
 
     def after(self, stamp: FrameStamp, seconds: float) -> FrameBoxes | None:
         """The frame of the same scene so many seconds later; None where there is none within LATE_S."""
-        wanted = stamp.timestamp_ns + round(seconds * 1e9)
+        time_ns = stamp.timestamp_ns + round(seconds * 1e9)
         times = self._times[stamp.scene]
-        nearest = int(np.abs(times - wanted).argmin())
-        return self._scenes[stamp.scene][nearest] if abs(times[nearest] - wanted) <= LATE_S * 1e9 else None
+        nearest = int(np.abs(times - time_ns).argmin())
+        return self._scenes[stamp.scene][nearest] if abs(times[nearest] - time_ns) <= LATE_S * 1e9 else None
 
 
 def with_true_futures(
@@ -191,9 +191,9 @@ def _true_lines(truth: ScoredInput) -> LinesFile:
         if (lines := result_of(MapLines, frame.ground_truth_results)) is None:
             expansion = f"the map expansion in {truth.path / 'maps' / 'expansion'}"
             expected = expansion if is_nuscenes_root(truth.path) else "a drive that has them"
-            where = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
+            frame_name = f'scene "{frame.stamp.scene}"' if frame.stamp.scene else f"frame {frame.stamp.index}"
             raise InputError(
-                f"{drive.name}: `map` (`--map`): {where} has no true lines of the map (expected {expected})"
+                f"{drive.name}: `map` (`--map`): {frame_name} has no true lines of the map (expected {expected})"
             )
         ground = Ground(frame.stamp, frame.rig.ego_from_bev, frame.world_from_ego)
         frames.append(FrameLines(frame.stamp, replace(lines, points=tuple(map(ground.points, lines.points)))))
@@ -230,10 +230,10 @@ def _times(predictions: Sequence[FrameBoxes]) -> Array:
 
 def ego_from_bev_of(frame: FrameBoxes) -> Array:
     """(4, 4), that a frame states, or else nuScenes'."""
-    stated = frame.extras.get("ego_from_bev")
-    if stated is None:
+    pose = frame.extras.get("ego_from_bev")
+    if pose is None:
         return default_ego_from_bev()
-    return pose_from_json(stated, "ego_from_bev", f"frame {frame.stamp.index}").matrix
+    return pose_from_json(pose, "ego_from_bev", f"frame {frame.stamp.index}").matrix
 
 
 def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.PlanScores, tuple[str, ...]]:

@@ -220,10 +220,10 @@ class MotionHead(nn.Module):
         features = F.pad(lines.features, (0, 0, 0, 1))  # the entry without a line has no features
         values = features[:, None].expand(-1, positions.shape[1], -1, -1)
         # As in the released code, the object itself is at the origin.
-        own = self.line_position(positions.new_zeros(1, 1, 2))
+        origin = self.line_position(positions.new_zeros(1, 1, 2))
         attended = self.line_attention(
             modes.flatten(0, 1),
-            own,
+            origin,
             values.flatten(0, 1),
             self.line_position(relative).flatten(0, 1),
             masked.flatten(0, 1),

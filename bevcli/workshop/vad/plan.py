@@ -44,8 +44,8 @@ class PlanWriter(GrowingFile):
             return
         stamp, rows = ground.stamp, []
         for command, path in zip(plan.commands, ground.points(plan.paths), strict=True):
-            given = "true" if command == plan.command else "false"
-            head = (stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, self._reference, cell_of(command), given)
+            is_given = "true" if command == plan.command else "false"
+            head = (stamp.index, cell_of(stamp.scene), stamp.timestamp_ns, self._reference, cell_of(command), is_given)
             for seconds, point in zip(plan.times_s, path, strict=True):
                 rows.append((*head, f"{seconds:g}", *(f"{value:.3f}" for value in point)))
         self._append(rows)
@@ -134,7 +134,7 @@ def _frame_plan(rows: list[CsvRow]) -> FramePlan:
     reference = first.cells["frame_of_reference"]
     if reference not in ("world", "ego"):
         raise first.error("frame_of_reference", f'expected world or ego, found "{reference:.40}"')
-    given, commands, paths = "", [], []
+    given_command, commands, paths = "", [], []
     times = [row.number("seconds") for row in rows if row.cells["command"] == first.cells["command"]]
     for command, steps in groupby(rows, key=lambda row: row.cells["command"]):
         path = list(steps)
@@ -142,7 +142,7 @@ def _frame_plan(rows: list[CsvRow]) -> FramePlan:
             raise path[0].error("seconds", "expected the same steps for every command of a frame")
         if path[0].cells["given"] not in ("true", "false"):
             raise path[0].error("given", f'expected true or false, found "{path[0].cells["given"]:.40}"')
-        given = command if path[0].cells["given"] == "true" else given
+        given_command = command if path[0].cells["given"] == "true" else given_command
         commands.append(command)
         paths.append([[row.number(axis) for axis in "xyz"] for row in path])
-    return FramePlan(stamp, reference, Plan(tuple(commands), np.array(paths), np.array(times), given))
+    return FramePlan(stamp, reference, Plan(tuple(commands), np.array(paths), np.array(times), given_command))

@@ -100,15 +100,15 @@ class Bag:
             reason = reason_of(error)
             raise InputError(f"{self.path}: {topic}: message {index} cannot be decoded ({reason:.200})") from None
 
-    def read(self, topic: str, index: int, parse: Callable[[Any], _Value], kind: str) -> _Value:
-        """The value that `parse` makes of a message. Raises InputError also if it is not `kind`, such as "a pose"."""
+    def read(self, topic: str, index: int, parse: Callable[[Any], _Value], description: str) -> _Value:
+        """The value that `parse` makes of a message. Raises InputError also for none of a `description` ("a pose")."""
         message = self.message(topic, index)
         try:
             return parse(message)
         except (AttributeError, ValueError) as error:
-            raise InputError(f"{self.path}: {topic}: message {index} is not {kind} ({error})") from None
+            raise InputError(f"{self.path}: {topic}: message {index} is not {description} ({error})") from None
 
-    def first(self, topic: str, parse: Callable[[Any], _Value], kind: str) -> _Value:
+    def first(self, topic: str, parse: Callable[[Any], _Value], description: str) -> _Value:
         """The first value of a topic's messages that is valid, and not empty: nodes publish before they are set up.
 
         Raises InputError as `read` for the first message, if no message has a value.
@@ -117,7 +117,7 @@ class Bag:
         invalid: InputError | None = None
         for index in range(min(len(self.times(topic)), MOST_INVALID)):
             try:
-                values.append(self.read(topic, index, parse, kind))
+                values.append(self.read(topic, index, parse, description))
             except InputError as error:
                 invalid = invalid or error
             if values and values[-1]:
@@ -139,15 +139,15 @@ class Bag:
         """The files in order. Also notes whether rosbag2 compressed single messages."""
         if self.path.is_file():
             return [self.path]
-        found = sorted(file for file in self.path.iterdir() if file.suffix in BAG_SUFFIXES)
-        stated = _metadata(self.path / BAG_METADATA)
-        listed = [self.path / Path(name).name for name in stated.get("relative_file_paths", [])]
-        mode = str(stated.get("compression_mode", "")).lower()
+        files = sorted(file for file in self.path.iterdir() if file.suffix in BAG_SUFFIXES)
+        metadata = _metadata(self.path / BAG_METADATA)
+        listed = [self.path / Path(name).name for name in metadata.get("relative_file_paths", [])]
+        mode = str(metadata.get("compression_mode", "")).lower()
         packed = sorted(file.name for file in self.path.iterdir() if is_packed_bag(file))
-        if packed and not found:
+        if packed and not files:
             raise InputError(f"{self.path}: its files are compressed: decompress them first (zstd -d {packed[0]})")
         self._compression = mode
-        paths = [file for file in listed if file.suffix in BAG_SUFFIXES and file.is_file()] or found
+        paths = [file for file in listed if file.suffix in BAG_SUFFIXES and file.is_file()] or files
         if not listed and len({SPLIT_NUMBER.sub("", file.stem) for file in paths}) > 1:
             names = ", ".join(file.name for file in paths[:4])
             raise InputError(f"{self.path}: has several bags and no {BAG_METADATA}: pass one of them ({names})")
@@ -162,8 +162,8 @@ def _metadata(path: Path) -> dict[str, Any]:
         document = read_yaml(path)
     except InputError:
         return {}
-    found = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
-    return found if isinstance(found, dict) else {}
+    bag_information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    return bag_information if isinstance(bag_information, dict) else {}
 
 
 def _open_file(path: Path) -> McapFile | SqliteFile:
@@ -177,9 +177,9 @@ def _number(file: Path) -> tuple[int, str]:
     return (int(digits) if digits.isdigit() else 0, file.name)
 
 
-def spread(count: int, wanted: int) -> Indices[int]:
-    """Up to `wanted` different indices below `count`, evenly spread, with the first and the last."""
-    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, wanted)).astype(int)).tolist()
+def spread(count: int, most: int) -> Indices[int]:
+    """Up to `most` different indices below `count`, evenly spread, with the first and the last."""
+    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
     return indices
 
 
@@ -206,17 +206,17 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
     """
     if path is None:
         return StatedTopics(renamed=topics)
-    stated = parse_toml(read_text(path, TOML_BYTES), path)
-    known = [entry.name for entry in fields(StatedTopics) if entry.name != "renamed"]
-    for key, value in stated.items():
-        if key not in known:
-            raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(known)})')
+    document = parse_toml(read_text(path, TOML_BYTES), path)
+    names = [entry.name for entry in fields(StatedTopics) if entry.name != "renamed"]
+    for key, value in document.items():
+        if key not in names:
+            raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(names)})')
         is_table = key in ("cameras", "calibration", "frames")
         if is_table and not (isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values())):
             raise InputError(f'{path}: "{key}": expected a table of names, such as CAM_FRONT = "..."')
         if not (is_table or isinstance(value, str)):
             raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
-    return StatedTopics(**stated, renamed=topics)
+    return StatedTopics(**document, renamed=topics)
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ class TopicFinder:
 
     def __init__(self, bag: Bag, stated: StatedTopics, calibrated: Iterable[str] | None = None) -> None:
         """calibrated: the cameras of a calibration file, which all must be found. None: the bag is the calibration."""
-        self._bag, self._stated = bag, stated
+        self._bag, self._topics = bag, stated
         self._kinds = {
             name: KINDS[topic.short_type]
             for name, topic in bag.topics.items()
@@ -252,11 +252,11 @@ class TopicFinder:
         }
         for name in (*stated.cameras.values(), *stated.renamed.values(), *stated.calibration.values()):
             self._check_exists(name)
-        found = self._found_images()
-        found = dict(_for_calibration(found, tuple(calibrated), bag)) if calibrated is not None else found
+        images_of = self._found_images()
+        images_of = dict(_for_calibration(images_of, tuple(calibrated), bag)) if calibrated is not None else images_of
         cameras = [
             CameraTopics(name, images, self._calibration_of(name, images), self._kinds[images] == "video")
-            for name, images in found.items()
+            for name, images in images_of.items()
         ]
         without = [camera for camera in cameras if camera.calibration is None and calibrated is None]
         for camera in without:
@@ -276,14 +276,14 @@ class TopicFinder:
 
     def of_kind(self, kind: Kind) -> list[str]:
         """Names of the topics of a kind that have messages."""
-        return [name for name, own in self._kinds.items() if own == kind]
+        return [name for name, topic_kind in self._kinds.items() if topic_kind == kind]
 
     def pose_topic(self) -> str | None:
         """The topic of the vehicle's poses: Odometry rather than a pose. None: they may be in the transforms."""
-        stated = self._stated.ego_motion
-        if stated:
-            self._check_exists(stated)
-            return stated if self._kinds[stated] == "pose" else None
+        stated_topic = self._topics.ego_motion
+        if stated_topic:
+            self._check_exists(stated_topic)
+            return stated_topic if self._kinds[stated_topic] == "pose" else None
         poses = [name for name in self.of_kind("pose") if not GOALS.search(name)]
         return min(poses, key=lambda name: (name not in PREFERRED_POSES, self._preference(name), name), default=None)
 
@@ -303,10 +303,10 @@ class TopicFinder:
         rows += [("transforms", name) for name in self.of_kind("transforms") if name != pose]
         used = {name for _, name in rows}
         rows += [("not used", name) for name in self._bag.topics if name not in used]
-        lines = [(f"  {role}", name, *self._facts(name)) for role, name in rows]
+        lines = [(f"  {role}", name, *self._type_and_count(name)) for role, name in rows]
         return "topics:\n" + aligned(lines, left=range(4))
 
-    def _facts(self, name: str) -> tuple[str, str]:
+    def _type_and_count(self, name: str) -> tuple[str, str]:
         times = self._bag.times(name)
         rate = f", {1e9 / np.median(np.diff(times)):.3g} Hz" if len(times) > 2 and np.median(np.diff(times)) else ""
         return self._bag.topics[name].short_type, counted(len(times), "messages") + rate
@@ -315,15 +315,15 @@ class TopicFinder:
         if name not in self._bag.topics:
             raise InputError(f"{self._bag.path}: has no topic {name} ({self.seen()})")
         if name not in self._kinds:
-            kind = self._bag.topics[name].short_type
-            problem = f"type {kind} cannot be used" if len(self._bag.times(name)) else "has no messages"
+            type_name = self._bag.topics[name].short_type
+            problem = f"type {type_name} cannot be used" if len(self._bag.times(name)) else "has no messages"
             raise InputError(f"{self._bag.path}: topic {name}: {problem} ({self.seen()})")
 
     def _found_images(self) -> dict[str, str]:
         """Camera -> image topic: the stated ones, and one for each other group of topics."""
-        if self._stated.cameras:
-            return {**self._stated.cameras, **self._stated.renamed}
-        taken = {_camera_path(name) for name in self._stated.renamed.values()}
+        if self._topics.cameras:
+            return {**self._topics.cameras, **self._topics.renamed}
+        taken = {_camera_path(name) for name in self._topics.renamed.values()}
         groups: dict[tuple[str, ...], list[str]] = {}
         for name in sorted([*self.of_kind("image"), *self.of_kind("video")]):
             if not NOT_A_CAMERA.search(name.lower()) and _camera_path(name) not in taken:
@@ -332,15 +332,15 @@ class TopicFinder:
             path: min(topics, key=lambda name: (self._preference(name), not RECTIFIED.search(name), name))
             for path, topics in groups.items()
         }
-        return {**self._stated.renamed, **dict(_named(best))}
+        return {**self._topics.renamed, **dict(_named(best))}
 
     def _preference(self, name: str) -> int:
         return list(KINDS).index(self._bag.topics[name].short_type)
 
     def _calibration_of(self, camera: str, images: str) -> str | None:
         """The calibration topic in the nearest namespace around the images, or else with the same frame."""
-        if camera in self._stated.calibration:
-            return self._stated.calibration[camera]
+        if camera in self._topics.calibration:
+            return self._topics.calibration[camera]
         infos = self.of_kind("calibration")
         around = [name for name in infos if images.startswith(name.rpartition("/")[0] + "/")]
         nested = [name for name in around if name.rpartition("/")[0]]
@@ -352,9 +352,9 @@ class TopicFinder:
 
 
 def _camera_path(topic: str) -> tuple[str, ...]:
-    """The parts of a topic's name that name the camera: /camera/front/image_raw -> (camera, front)."""
-    parts = [part for part in topic.split("/") if part]
-    return tuple(part for part in parts if not GENERIC.fullmatch(part.lower())) or (parts[-1],)
+    """The words of a topic's name that name the camera: /camera/front/image_raw -> (camera, front)."""
+    words = [word for word in topic.split("/") if word]
+    return tuple(word for word in words if not GENERIC.fullmatch(word.lower())) or (words[-1],)
 
 
 def _named(topics: Mapping[tuple[str, ...], str]) -> Iterator[tuple[str, str]]:
@@ -366,16 +366,16 @@ def _named(topics: Mapping[tuple[str, ...], str]) -> Iterator[tuple[str, str]]:
         yield "_".join(path[-count:]), topic
 
 
-def _for_calibration(found: Mapping[str, str], names: tuple[str, ...], bag: Bag) -> Iterator[tuple[str, str]]:
+def _for_calibration(topics: Mapping[str, str], names: tuple[str, ...], bag: Bag) -> Iterator[tuple[str, str]]:
     """Camera of a calibration file -> topic: of the same name, or with the name as a part."""
     for name in names:
         lower = name.lower()
-        same = [topic for camera, topic in found.items() if camera.lower() == lower]
-        chosen = same or [topic for topic in found.values() if lower in topic.lower().split("/")]
-        if len(chosen) != 1:
-            offered = ", ".join(found.values()) or "none"
+        same = [topic for camera, topic in topics.items() if camera.lower() == lower]
+        fitting = same or [topic for topic in topics.values() if lower in topic.lower().split("/")]
+        if len(fitting) != 1:
+            offered = ", ".join(topics.values()) or "none"
             raise InputError(
                 f"{bag.path}: camera {name} of the calibration: its image topic was not found (image topics: "
                 f"{offered}): pass `topics={{{name!r}: '/TOPIC'}}` (`--topic {name}=/TOPIC`)"
             )
-        yield name, chosen[0]
+        yield name, fitting[0]

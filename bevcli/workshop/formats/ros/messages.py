@@ -85,10 +85,10 @@ def transforms_of(message: Any) -> Iterator[Transform]:
     if hasattr(message, "pose"):
         yield pose_of(message)
         return
-    for part in message.transforms if hasattr(message, "transforms") else (message,):
-        parent = frame_of(part) if hasattr(part, "transform") else str(part.parent_frame_id).lstrip("/")
-        child, inner = str(part.child_frame_id).lstrip("/"), getattr(part, "transform", part)
-        yield Transform(parent, child, timestamp_ns(part), _pose(inner.translation, inner.rotation))
+    for transform in message.transforms if hasattr(message, "transforms") else (message,):
+        parent = frame_of(transform) if hasattr(transform, "transform") else str(transform.parent_frame_id).lstrip("/")
+        child, inner = str(transform.child_frame_id).lstrip("/"), getattr(transform, "transform", transform)
+        yield Transform(parent, child, timestamp_ns(transform), _pose(inner.translation, inner.rotation))
 
 
 def pose_of(message: Any) -> Transform:

@@ -82,11 +82,11 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
     time, data = timestamp_ns(message) or time_ns, payload(message)
     if hasattr(message, "encoding"):
         return CameraImage(time, _raw_pixels(message, data, name))
-    stated = str(getattr(message, "format", ""))
-    pixels, is_as_stored = _decoded(data, stated)
-    if pixels is None and stated and size_of_image(data) is None and not COMPRESSED.search(stated):
+    codec = str(getattr(message, "format", ""))
+    pixels, is_as_stored = _decoded(data, codec)
+    if pixels is None and codec and size_of_image(data) is None and not COMPRESSED.search(codec):
         raise InputError(
-            f"{bag.path}: {topic}: images of format {one_line(stated, 60)} are not read (expected JPEG, PNG, WebP, "
+            f"{bag.path}: {topic}: images of format {one_line(codec, 60)} are not read (expected JPEG, PNG, WebP, "
             "TIFF or BMP, or video as foxglove.CompressedVideo): write the topic in one of these"
         )
     if pixels is None:
@@ -95,13 +95,13 @@ def _read_message(bag: Bag, topic: str, index: int, time_ns: int, name: str) -> 
     return CameraImage(time, pixels, data if media_type else None, media_type)
 
 
-def _decoded(data: bytes, stated: str) -> tuple[NDArray[np.uint8] | None, bool]:
+def _decoded(data: bytes, codec: str) -> tuple[NDArray[np.uint8] | None, bool]:
     """(H, W, 3) uint8 BGR of a compressed image, None for a broken one; False if the file shows other colours.
 
-    stated: the format. After "compressed", ROS's image_transport names the encoding of what OpenCV compressed as if it
+    codec: the format. After "compressed", ROS's image_transport names the encoding of what OpenCV compressed as if it
     were BGR or grey, such as in "rgb8; png compressed rgb8" and "bayer_rggb8; jpeg compressed ".
     """
-    before, _, after = stated.partition("compressed")
+    before, _, after = codec.partition("compressed")
     encoding = after.strip() or before.partition(";")[0]
     pixels = decode_image(data, cv2.IMREAD_UNCHANGED, MOST_PIXELS) if BAYER.fullmatch(encoding) else None
     if pixels is not None and pixels.ndim == 2:
@@ -118,13 +118,13 @@ def _raw_pixels(message: Any, data: bytes, where: str) -> NDArray[np.uint8]:
 
     Raises InputError for an encoding that is not supported, and UnreadableImage if bytes are missing.
     """
-    known = RAW_ENCODINGS.get(str(message.encoding))
-    if known is None:
+    layout = RAW_ENCODINGS.get(str(message.encoding))
+    if layout is None:
         raise InputError(
             f"{where}: encoding {message.encoding} is not supported (expected {', '.join(list(RAW_ENCODINGS)[:8])} or "
             "a Bayer pattern)"
         )
-    channels, depth, conversion = known
+    channels, depth, conversion = layout
     height, width = int(message.height), int(message.width)
     row_bytes = width * channels * depth
     step = int(message.step) or row_bytes
@@ -202,7 +202,7 @@ def _is_keyframe(packet: bytes, video_format: str) -> bool:
     return any(head >> 1 & 0x3F in (32, 33) for head in heads)
 
 
-def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.ListedDrive:
+def open_bag(path: Path, common: InputOptions, options: BagOptions) -> images.ListedDrive:
     """A bag as a `Drive`. Opening it reads the index, the calibration, the poses and the times of the images.
 
     The camera with the lowest rate leads: each of its images is a frame, with the other cameras' nearest images.
@@ -215,17 +215,17 @@ def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.Listed
         )
     if path.is_file() and is_packed_bag(path):
         raise InputError(f"{path}: is compressed: decompress it first (such as zstd -d {path.name})")
-    stated = read_topics_file(own.topics_file, own.topics)
-    draft = draft_of(own, path)
+    stated_topics = read_topics_file(options.topics_file, options.topics)
+    draft = draft_of(options, path)
     rig = None if draft is None else draft.rig
     bag = Bag(path)
-    rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, own)
-    finder = TopicFinder(bag, stated, rig.names if rig else None)
-    reader = VehicleReader(bag, finder, stated)
+    rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, options)
+    finder = TopicFinder(bag, stated_topics, rig.names if rig else None)
+    reader = VehicleReader(bag, finder, stated_topics)
     used_rig = reader.rig() if rig is None else rig
     entries = _entries(bag, finder.cameras)
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    drive_poses = DrivePoses(used_rig, own, frame_times)
+    drive_poses = DrivePoses(used_rig, options, frame_times)
     motion, source, motion_notes = reader.motion(common.ego_motion, file, drive_poses)
     geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
     entries, gaps = _covered(entries, motion, path)
@@ -249,19 +249,19 @@ def open_bag(path: Path, common: InputOptions, own: BagOptions) -> images.Listed
 
 
 def _files_beside(
-    folder: Path, rig: CameraRig | None, common: InputOptions, own: BagOptions
+    folder: Path, rig: CameraRig | None, common: InputOptions, options: BagOptions
 ) -> tuple[CameraRig | None, DriveFacts, Path | None, list[str]]:
     """Rig, facts, ego-motion file and notes: those of files beside the bag, where no others are given."""
     calibration, notes = folder / CALIBRATION, []
     draft = draft_rig(calibration, folder).checked(calibration) if is_there(calibration) else None
-    found, facts = (None, DriveFacts()) if draft is None else (draft.rig, draft.facts)
-    if rig is None and found is not None:
+    rig_beside, facts = (None, DriveFacts()) if draft is None else (draft.rig, draft.facts)
+    if rig is None and rig_beside is not None:
         notes.append(f"{calibration} is used in place of the calibration in the bag")
-    file = own.ego_motion_file
+    file = options.ego_motion_file
     if file is None and common.ego_motion != "static" and is_there(folder / EGO_MOTION_FILE):
         file = folder / EGO_MOTION_FILE
         notes.append(f"{file} is used in place of the poses in the bag")
-    return found if rig is None else rig, facts, file, notes
+    return rig_beside if rig is None else rig, facts, file, notes
 
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameEntry, ...]:
@@ -269,7 +269,7 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameE
     captured = capture_times(bag, [camera.images for camera in cameras])
     times = {camera.camera: captured[camera.images][0] for camera in cameras}
     # The median time between images; a second for a single one.
-    periods = {n: float(np.median(np.diff(own))) if len(own) > 1 else 1e9 for n, own in times.items()}
+    periods = {n: float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e9 for n, stamps in times.items()}
     slowest = max(periods.values())
     leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
     makers: dict[str, Callable[[int, int], images.Source]] = {
@@ -285,12 +285,12 @@ def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameE
             continue  # a message that was recorded twice
         sources: dict[str, images.Source] = {}
         dropped = {}
-        for name, own in times.items():
-            index = number if name == leading else int(nearest(own, time))
-            if abs(int(own[index]) - time) > 0.501 * periods[name]:
+        for name, stamps in times.items():
+            index = number if name == leading else int(nearest(stamps, time))
+            if abs(int(stamps[index]) - time) > 0.501 * periods[name]:
                 dropped[name] = f"{topics[name]} has no image within {periods[name] / 2e6:.0f} ms of {time} ns"
             else:
-                sources[name] = makers[name](index, int(own[index]))
+                sources[name] = makers[name](index, int(stamps[index]))
         origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][number]}"
         entries.append(images.FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
     return tuple(entries)

@@ -137,8 +137,8 @@ class McapFile:
     def _read_references(self, topic: str) -> NDArray[np.int64]:
         """(N, 3) log time, start of the chunk or NO_CHUNK, and offset of a topic's messages, in order of time."""
         channels = [number for number, channel in self._channels.items() if channel.topic == topic]
-        parts = [part for number in channels for part in self._references_in(number)]
-        rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *parts])
+        references_by_chunk = [references for number in channels for references in self._references_in(number)]
+        rows = np.concatenate([np.zeros((0, 3), dtype=np.int64), *references_by_chunk])
         return rows[np.argsort(rows[:, 0], kind="stable")]
 
     def _references_in(self, channel: int) -> Iterator[NDArray[np.int64]]:
@@ -154,8 +154,8 @@ class McapFile:
 
     def _record(self, position: int, opcode: int) -> bytes:
         self._file.seek(position)
-        found, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
-        if found != opcode or length > self.path.stat().st_size:
+        found_opcode, length = RECORD_HEAD.unpack(self._file.read(RECORD_HEAD.size))
+        if found_opcode != opcode or length > self.path.stat().st_size:
             raise InputError(f"{self.path}: the index is broken (at byte {position})")
         return self._file.read(length)
 
@@ -262,9 +262,9 @@ class SqliteFile:
             raise InputError(f"{path}: cannot be read as a rosbag2 database ({error})") from None
         self._ids: dict[str, list[int]] = {}
         self.topics: dict[str, Topic] = {}
-        for number, name, kind, serialization in rows:
+        for number, name, type_name, serialization in rows:
             self._ids.setdefault(name, []).append(number)
-            self.topics[name] = Topic(name, kind, serialization, *definitions.get(kind, ("", b"")))
+            self.topics[name] = Topic(name, type_name, serialization, *definitions.get(type_name, ("", b"")))
 
     def times(self, topic: str) -> NDArray[np.int64]:
         """(N,) log times of a topic's messages in order, ns. The messages themselves are not read."""
@@ -274,10 +274,10 @@ class SqliteFile:
         """The bytes of message `index` of a topic. Raises InputError if they are broken."""
         row = int(self._references[topic][index, 1])
         try:
-            found = self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
-            if not isinstance(found, bytes):
-                raise TypeError(f"{found!r:.50} is not bytes")
-            return found
+            data = self._database.execute("SELECT data FROM messages WHERE id = ?", (row,)).fetchone()[0]
+            if not isinstance(data, bytes):
+                raise TypeError(f"{data!r:.50} is not bytes")
+            return data
         except (sqlite3.Error, TypeError) as error:
             raise InputError(f"{self.path}: {topic}: message {index} is broken ({error})") from None
 
@@ -300,13 +300,13 @@ class SqliteFile:
     def _check_tables(self) -> None:
         """Raises sqlite3.Error unless the tables of the bag hold plain values: code in a file can compute for ever."""
         self._database.execute("PRAGMA trusted_schema = OFF")
-        kinds = self._database.execute("SELECT name, type, rootpage FROM sqlite_master").fetchall()
-        for name, kind, page in kinds:
-            if name.lower() not in TABLES or kind == "index":
+        entries = self._database.execute("SELECT name, type, rootpage FROM sqlite_master").fetchall()
+        for name, entry_type, page in entries:
+            if name.lower() not in TABLES or entry_type == "index":
                 continue
-            if kind != "table" or not page:
-                found = "virtual table" if kind == "table" else kind
-                raise sqlite3.DatabaseError(f"{name} is a {found} (expected a table)")
+            if entry_type != "table" or not page:
+                description = "virtual table" if entry_type == "table" else entry_type
+                raise sqlite3.DatabaseError(f"{name} is a {description} (expected a table)")
             for _, column, _, _, _, _, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"):
                 if hidden:
                     raise sqlite3.DatabaseError(f"{name}: column {column:.50} is computed (expected stored values)")
@@ -319,7 +319,7 @@ class SqliteFile:
             ).fetchall()
         except sqlite3.OperationalError:
             return {}
-        return {kind: (encoding, text.encode()) for kind, encoding, text in rows if text}
+        return {type_name: (encoding, text.encode()) for type_name, encoding, text in rows if text}
 
 
 def decoder(topic: Topic) -> Decode:
@@ -345,8 +345,8 @@ def _cdr(topic: Topic) -> Decode:
             store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
         store.get_msgdef(name)
     except (TypesysError, KeyError, ValueError) as error:
-        found = "its definition cannot be read" if text else "the bag has no definition of it, and it is not a ROS type"
-        raise InputError(f"{topic.name}: type {name}: {found} ({error})") from None
+        cause = "its definition cannot be read" if text else "the bag has no definition of it, and it is not a ROS type"
+        raise InputError(f"{topic.name}: type {name}: {cause} ({error})") from None
     return lambda data: store.deserialize_cdr(data, name)
 
 
@@ -366,19 +366,19 @@ def _protobuf(topic: Topic) -> Decode:
     return message.FromString
 
 
-def decompressed(kind: str, data: bytes, largest: int) -> bytes:
+def decompressed(compression: str, data: bytes, largest: int) -> bytes:
     """The bytes of compressed data.
 
-    kind: "zstd", "lz4", or "" for data that is not compressed.
+    compression: "zstd", "lz4", or "" for data that is not compressed.
     Raises ValueError for another kind, damaged data, or more than `largest` bytes. Data that is cut off may give less.
     """
-    kinds = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
-    if kind not in kinds:
-        raise ValueError(f'unknown compression "{kind:.20}" (expected zstd, lz4 or none)')
-    found = kinds[kind](data, largest + 1)
-    if len(found) > largest:
+    decompressors = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
+    if compression not in decompressors:
+        raise ValueError(f'unknown compression "{compression:.20}" (expected zstd, lz4 or none)')
+    content = decompressors[compression](data, largest + 1)
+    if len(content) > largest:
         raise ValueError(f"has more than {largest} bytes when it is decompressed")
-    return found
+    return content
 
 
 def _from_zstd(data: bytes, largest: int) -> bytes:

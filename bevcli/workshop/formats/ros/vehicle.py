@@ -54,12 +54,12 @@ class TransformTree:
 
     def up(self, frame: str) -> dict[str, Array]:
         """(4, 4) ancestor_from_frame of a frame and of its ancestors, the root last."""
-        found = {frame: rigid()}
-        while frame in self._parents and self._parents[frame][0] not in found:
+        ancestors = {frame: rigid()}
+        while frame in self._parents and self._parents[frame][0] not in ancestors:
             parent, parent_from_child = self._parents[frame]
-            found[parent] = parent_from_child @ found[frame]
+            ancestors[parent] = parent_from_child @ ancestors[frame]
             frame = parent
-        return found
+        return ancestors
 
 
 def read_transforms(bag: Bag, topic: str, number: int) -> list[Transform]:
@@ -81,16 +81,16 @@ def sampled_transforms(bag: Bag, topics: Iterable[str]) -> tuple[list[Transform]
     changing: list[Transform] = []
     notes: list[str] = []
     for topic in topics:
-        found: list[Transform] = []
+        transforms: list[Transform] = []
         for number in range(min(len(bag.times(topic)), MOST_MESSAGES)):
             if number and number % SAMPLED_MESSAGES == 0:
-                valid = {transform.child for transform in found if transform.parent_from_child is not None}
-                if valid.issuperset(transform.child for transform in found):
+                valid = {transform.child for transform in transforms if transform.parent_from_child is not None}
+                if valid.issuperset(transform.child for transform in transforms):
                     break
-            found += read_transforms(bag, topic, number)
+            transforms += read_transforms(bag, topic, number)
         if is_static(topic):
-            notes += invalid_note(topic, [transform.parent_from_child is not None for transform in found])
-        (static if is_static(topic) else changing).extend(found)
+            notes += invalid_note(topic, [transform.parent_from_child is not None for transform in transforms])
+        (static if is_static(topic) else changing).extend(transforms)
     return static, changing, notes
 
 
@@ -145,7 +145,7 @@ def _motion_from(
             if transform.parent_from_child is not None:
                 samples[link][transform.timestamp_ns or time] = transform.parent_from_child
     source = " and ".join(topics)
-    parts = [_motion(sorted(own.items())) for own in samples.values() if own]
+    parts = [_motion(sorted(samples_of_link.items())) for samples_of_link in samples.values() if samples_of_link]
     first, last = max((part.first_ns for part in parts), default=0), min((part.last_ns for part in parts), default=0)
     if len(parts) < len(links) or first > last:
         raise InputError(f"{bag.path}: {source}: has no poses of {' and '.join(links)}")
@@ -175,8 +175,8 @@ def _motion(samples: Sequence[tuple[int, Pose]]) -> EgoMotion:
             kept.append(index)
     seconds = (times - times[0]) / 1e9
     kinematics = (
-        np.stack([np.interp(seconds, seconds[kept], column) for column in part.T], axis=-1)
-        for part in derive_kinematics(times[kept], translations[kept], quaternions[kept])
+        np.stack([np.interp(seconds, seconds[kept], column) for column in values.T], axis=-1)
+        for values in derive_kinematics(times[kept], translations[kept], quaternions[kept])
     )
     return EgoMotion(times, translations, quaternions, *kinematics, velocities_are_stated=False)
 
@@ -189,36 +189,36 @@ def capture_times(bag: Bag, topics: Iterable[str]) -> dict[str, tuple[NDArray[np
     a bag that was replayed at another speed, all messages are read, too.
     """
     logged = {topic: bag.times(topic) for topic in topics}
-    numbers = {topic: range(len(own)) for topic, own in logged.items()}
-    samples = numbers if bag.size <= READ_WHOLE else {topic: spread(len(own), SAMPLES) for topic, own in logged.items()}
-    stated = _stated_times(bag, samples)
-    found = {}
-    for topic, own in logged.items():
-        delays = [time - int(own[number]) for number, time in stated[topic].items() if time] or [0]
-        if max(delays) - min(delays) > LARGEST_SPREAD_NS and len(stated[topic]) < len(own):
-            stated |= _stated_times(bag, {topic: numbers[topic]})
-        captured = own + int(np.median(delays))
-        if len(stated[topic]) == len(own):
-            captured = np.array([stated[topic][number] or rough for number, rough in enumerate(captured)], np.int64)
+    numbers = {topic: range(len(log)) for topic, log in logged.items()}
+    samples = numbers if bag.size <= READ_WHOLE else {topic: spread(len(log), SAMPLES) for topic, log in logged.items()}
+    headers = _stated_times(bag, samples)
+    captured_and_order = {}
+    for topic, log in logged.items():
+        delays = [time - int(log[number]) for number, time in headers[topic].items() if time] or [0]
+        if max(delays) - min(delays) > LARGEST_SPREAD_NS and len(headers[topic]) < len(log):
+            headers |= _stated_times(bag, {topic: numbers[topic]})
+        captured = log + int(np.median(delays))
+        if len(headers[topic]) == len(log):
+            captured = np.array([headers[topic][number] or rough for number, rough in enumerate(captured)], np.int64)
         order = np.argsort(captured, kind="stable")
-        found[topic] = (captured[order], order)
-    return found
+        captured_and_order[topic] = (captured[order], order)
+    return captured_and_order
 
 
 def _stated_times(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> dict[str, dict[int, int]]:
     """The times that messages state, ns, by topic and number; 0 for none."""
-    found: dict[str, dict[int, int]] = {topic: {} for topic in numbers}
+    times: dict[str, dict[int, int]] = {topic: {} for topic in numbers}
     for _, topic, number in _in_order(bag, numbers):
-        found[topic][number] = 0
+        times[topic][number] = 0
         with contextlib.suppress(InputError, AttributeError, ValueError):
-            found[topic][number] = timestamp_ns(bag.message(topic, number))
-    return found
+            times[topic][number] = timestamp_ns(bag.message(topic, number))
+    return times
 
 
 def _in_order(bag: Bag, numbers: Mapping[str, Sequence[int]]) -> list[tuple[int, str, int]]:
     """Time of recording, topic and number of messages, in the order of recording: each chunk is decompressed once."""
     logged = {topic: bag.times(topic).tolist() for topic in numbers}
-    return sorted((logged[topic][number], topic, number) for topic, own in numbers.items() for number in own)
+    return sorted((logged[topic][number], topic, number) for topic, listed in numbers.items() for number in listed)
 
 
 def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
@@ -252,19 +252,19 @@ def find_geo_origin(bag: Bag, motion: EgoMotion | None) -> GeoOrigin | None:
 class VehicleReader:
     """Reads the rig of a bag, from CameraInfo and the transforms to the vehicle, and the vehicle's poses."""
 
-    def __init__(self, bag: Bag, finder: TopicFinder, stated: StatedTopics) -> None:
-        self._bag, self._finder, self._stated = bag, finder, stated
+    def __init__(self, bag: Bag, finder: TopicFinder, stated_topics: StatedTopics) -> None:
+        self._bag, self._finder, self._topics = bag, finder, stated_topics
         static, changing, self.notes = sampled_transforms(bag, finder.of_kind("transforms"))
         self._tree, self._moving = TransformTree([*static, *changing]), {transform.child for transform in changing}
-        self.ego_frame = stated.ego_frame
+        self.ego_frame = stated_topics.ego_frame
 
     def rig(self) -> CameraRig:
         """The cameras, in order of their names as found. Raises InputError if intrinsics or extrinsics are missing."""
         cameras = self._finder.cameras
-        frames = {camera.camera: self._stated.frames.get(camera.camera) or self._frame_of(camera) for camera in cameras}
+        frames = {camera.camera: self._topics.frames.get(camera.camera) or self._frame_of(camera) for camera in cameras}
         self.ego_frame = self.ego_frame or self._find_ego_frame(list(frames.values()))
-        found = tuple(self._camera(camera, self._ego_from(frames[camera.camera], camera.camera)) for camera in cameras)
-        return CameraRig(found, default_ego_from_bev(), ego_from_bev_assumed=True)
+        placed = tuple(self._camera(camera, self._ego_from(frames[camera.camera], camera.camera)) for camera in cameras)
+        return CameraRig(placed, default_ego_from_bev(), ego_from_bev_assumed=True)
 
     def _frame_of(self, topics: CameraTopics) -> str:
         named = (
@@ -303,20 +303,20 @@ class VehicleReader:
         return self._bag.first(topic, lambda message: pose_of(message).child, "a pose")
 
     def _ego_from(self, frame: str, camera: str) -> Array:
-        found = self._tree.between(self.ego_frame, frame)
-        if found is None:
+        ego_from_frame = self._tree.between(self.ego_frame, frame)
+        if ego_from_frame is None:
             frames = ", ".join(self._tree.frames[:12]) or "none"
             raise InputError(
                 f'{self._bag.path}: camera {camera}: no transform leads from its frame "{frame}" to "{self.ego_frame}" '
                 f"(frames: {frames}; {self._finder.seen()}): pass `calibration` (`--calibration FILE`), or name the "
                 "frames with `topics_file` (`--topics FILE.toml`)"
             )
-        if abs(found[2, 2]) > 0.7:
+        if abs(ego_from_frame[2, 2]) > 0.7:
             self.notes.append(
                 f'camera {camera}: it looks up or down, if "{frame}" is an optical frame (z ahead, x right): if it is '
                 "not, name the optical frame with `topics_file` (`--topics FILE.toml`)"
             )
-        return found
+        return ego_from_frame
 
     def motion(
         self, use: EgoMotionUse, file: Path | None, drive: DrivePoses
@@ -361,8 +361,8 @@ class VehicleReader:
     def _moving_path(self, ego_frame: str) -> list[str]:
         """Frames from the vehicle's to the world's, with links that move; a single one if there are none."""
         path = list(self._tree.up(ego_frame))
-        if self._stated.world_frame in path:
-            path = path[: path.index(self._stated.world_frame) + 1]
+        if self._topics.world_frame in path:
+            path = path[: path.index(self._topics.world_frame) + 1]
         moving = [index for index, frame in enumerate(path[:-1]) if frame in self._moving]
         # Static links above the topmost moving one only move the world; those below the lowest belong to the vehicle.
         path = path[moving[0] : moving[-1] + 2] if moving else path[:1]
