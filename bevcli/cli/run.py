@@ -11,7 +11,7 @@ import typer
 from bevcli.cli.bridge import FormatValues, InputDrive
 from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import PHOTOGRAPHS, ModelOptions
 from bevcli.options import Option
 from bevcli.printing import print_note, say
 from bevcli.recording.options import RecordingOptions
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from bevcli.workshop.checks.standing_check import StandingCheck
 
 PANEL = "Run"
-PHOTOGRAPHS = "photographs"  # the model in the package that learned from randomised images
 
 
 def run(
@@ -67,7 +66,7 @@ def run(
     gc.enable()
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
-    loaded = load_with_bar(model)
+    loaded = load_with_bar(model, [sequence])
     without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
     if source.ego_motion == "required" and without_poses and not source.odometry:
         run_options = replace(run_options, temporal=False)

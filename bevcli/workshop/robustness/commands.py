@@ -46,7 +46,7 @@ def stress(
     other = None if options.against is None else work.read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
-    loaded = load_with_bar(model)
+    loaded = load_with_bar(model, None if drive_options.rendered is not None else sequence)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
         drives = [bevcli.open_sequence(path, chosen, **format_options) for path in sequence or ()]

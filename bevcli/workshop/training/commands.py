@@ -2,13 +2,13 @@
 
 import contextlib
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-import bevcli
 from bevcli.cli.bridge import Json, Part, model_option
-from bevcli.cli.progress import Progress, last_of_steps
+from bevcli.cli.progress import Progress, last_of_steps, load_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions, StepOptions
@@ -99,7 +99,10 @@ def _run(trainer: "Trainer") -> None:
 def validate(
     model: Annotated[
         str | None,
-        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
+        model_option(
+            "A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else photographs, or "
+            "demo where bevcli rendered all drives."
+        ),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
@@ -116,7 +119,7 @@ def validate(
     """
     from bevcli.workshop.training import train as work, validation
 
-    loaded = bevcli.load_model(model, options=model_options)
+    loaded = load_with_bar(replace(model_options, model=model), work.paths_to_score(drive_options))
     drives = last_of_steps(work.drives_to_score(loaded.config, model or loaded.name, drive_options, options))
     notes = validation.check_scored_drives(drive_options, drives, loaded.config)
     if loaded.needs_export:
