@@ -3,7 +3,7 @@
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 import typer
 
 from bevcli.inference.options import ModelOptions
-from bevcli.printing import duration, one_line, print_note, say
+from bevcli.printing import duration, one_line, say
 
 if TYPE_CHECKING:
     import rich.progress
@@ -176,16 +176,10 @@ def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedW
     return fetch_weights(weights, force=force)
 
 
-def load_with_bar(options: ModelOptions, drives: Sequence[Path] | None = ()) -> "Model":
-    """The model of the options, whose weights are downloaded where `fetch` asks for it and they are not there.
+def load_with_bar(options: ModelOptions) -> "Model":
+    """The model of the options, whose weights are downloaded where `fetch` asks for it and they are not there."""
+    from bevcli.inference.load import load_model, weights_to_fetch
 
-    drives: by which it is chosen where the options name none, see `choose_model`.
-    """
-    from bevcli.inference.load import choose_model, load_model, weights_to_fetch
-
-    options, notes = choose_model(options, drives)
-    for note in notes:
-        print_note(note)
     weights = weights_to_fetch(options)
     if weights is not None:
         fetch_with_bar(weights)

@@ -63,7 +63,7 @@ def test_only_photographs_is_said(real):
 def test_a_run_chooses_it_by_its_drive(real, tmp_path):
     done = command(tmp_path, "run", str(real), "--frames", "0:1", "--untrained")
     assert done.returncode == 0, done.stderr
-    assert done.stderr.startswith("note: model photographs, as the drive is no rendering of bevcli")
+    assert "note: model photographs, as the drive is no rendering of bevcli" in done.stderr
     assert json.loads((tmp_path / "runs/real-photographs/summary.json").read_text())["model"] == "photographs"
 
 
