@@ -37,7 +37,7 @@ def test_the_commands_of_the_page_run(folder):
     assert done.returncode == 0, done.stderr
     assert "my_drive: 6 cameras" in done.stdout
     assert (folder / "runs/my_drive-project-debug/cameras.png").exists()
-    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/my_drive-demo")
+    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/my_drive-photographs")
     assert done.returncode == 0, done.stderr
     assert "numbered images at 2 Hz, none of 12 images missing" in done.stderr
     assert command(folder, *viz, "--summary").returncode == 0

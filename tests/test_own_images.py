@@ -91,4 +91,4 @@ def test_the_commands_of_the_page_run(my_drive, tmp_path):
         if arguments[0] != "viz":  # which opens a viewer
             done = command(tmp_path, *arguments)
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
-    assert (tmp_path / "runs/my_drive-demo/recording.rrd").exists()
+    assert (tmp_path / "runs/my_drive-photographs/recording.rrd").exists()

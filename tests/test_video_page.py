@@ -37,7 +37,7 @@ def test_the_page_is_one_screen():
 
 def test_the_video_runs_as_on_the_page(folder):
     [run] = [shlex.split(line) for line in COMMANDS if line.startswith("run ")]
-    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/dash-demo", "--force")
+    done = command(folder, *run, "--model", "demo.toml", "--untrained", "--out", "runs/dash-photographs", "--force")
     assert done.returncode == 0, done.stderr
     assert "without calibration: 1 camera" in done.stderr
     assert "no history is used" in done.stderr

@@ -11,7 +11,7 @@ import typer
 from bevcli.cli.bridge import FormatValues, InputDrive
 from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
-from bevcli.inference.options import ModelOptions
+from bevcli.inference.options import PHOTOGRAPHS, ModelOptions
 from bevcli.options import Option
 from bevcli.printing import print_note, say
 from bevcli.recording.options import RecordingOptions
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from bevcli.workshop.checks.standing_check import StandingCheck
 
 PANEL = "Run"
-PHOTOGRAPHS = "photographs"  # the model in the package that learned from randomised images
 
 
 def run(
@@ -61,12 +60,14 @@ def run(
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     gc.disable()  # a fifth faster: of the million objects of the packages, hardly any is garbage
+    from bevcli.inference.load import choose_model
     from bevcli.runs.run_into_folder import run_in_folder
     from bevcli.workshop.checks.standing_check import StandingCheck
 
     gc.enable()
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
+    model, why = choose_model(model, [sequence])
     loaded = load_with_bar(model)
     without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
     if source.ego_motion == "required" and without_poses and not source.odometry:
@@ -88,7 +89,7 @@ def run(
     options, path = replace(run_options, recording=recording), shlex.quote(str(sequence))
     files = run_in_folder(loaded, drive, out, options, live=live, force=output.force, resume=output.resume, source=path)
     with StopSignals("frame") as signals, files as running:
-        notes = [*running.summary.input_errors, *_run_notes(loaded, drive, live=output.live)]
+        notes = [*why, *running.summary.input_errors, *_run_notes(loaded, drive, live=output.live)]
         with Progress(len(drive.stamps), "frames", notes) as progress:
             progress.skip(running.done)
             for frame, prediction in running.frames:

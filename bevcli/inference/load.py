@@ -6,7 +6,7 @@ import platform
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -24,7 +24,15 @@ from bevcli.frame import ColorOrder, Drive, Frame, FrameStamp, Prediction, check
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.frames_from_memory import checked_images
-from bevcli.inference.options import EXPORTED_SUFFIX, FILE_ENGINE, TORCH, ModelOptions, StepOptions
+from bevcli.inference.options import (
+    EXPORTED_SUFFIX,
+    FILE_ENGINE,
+    PHOTOGRAPHS,
+    RENDERED,
+    TORCH,
+    ModelOptions,
+    StepOptions,
+)
 from bevcli.inference.preprocess import image_for_rig
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
@@ -36,7 +44,7 @@ from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather
 from bevcli.published import NamedWeights, all_weights, hub_model, named_weights
 from bevcli.registry import entries, is_of_hub, load
-from bevcli.sequences.files.calibration_file import read_calibration
+from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration, read_calibration
 from bevcli.sequences.images import AT_REST
 from bevcli.writing import weights_folder
 
@@ -45,7 +53,6 @@ try:
 except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
-DEFAULT_MODEL = "demo"
 WEIGHTS_SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
 
@@ -260,7 +267,8 @@ def load_model(
         model: a known model, one of `bevcli.config.known_models()` such as "tiny" or "demo", a name of the table of
             weights ("tiny-fp16"), a FILE.toml, a model of the Hugging Face Hub ("hf:OWNER/NAME" or
             "hf:OWNER/NAME@REVISION"), or an exported FILE.onnx, which holds its weights and runs on the CPU in the
-            precision of the file. None takes the model that the weights fit, or "demo" where there are no weights.
+            precision of the file. None takes the model that the weights fit, or "photographs" where there are no
+            weights; `bevcli run` takes "demo" where the drive is a rendering of bevcli.
         weights: an official .pth as published, or a .safetensors. None takes the weights of the package, which
             "demo" and "photographs" have, or downloaded ones.
         options: a model with its options; `model` and `weights` replace its own where they are given.
@@ -295,7 +303,7 @@ def load_model(
             f"`model={chosen.model}` (`--model`): is a file of weights: pass it as `weights={chosen.model}` "
             f"(`--weights {chosen.model}`)"
         )
-    name = str(chosen.model or (DEFAULT_MODEL if chosen.weights is None else _model_of(chosen.weights)))
+    name = str(chosen.model or (PHOTOGRAPHS if chosen.weights is None else _model_of(chosen.weights)))
     of_hub = None
     if is_of_hub(name):  # here, because `fetch` looks for a newer version
         of_hub = hub_model(name, fetch=chosen.fetch)
@@ -327,6 +335,37 @@ def load_model(
     )
 
 
+def default_model(drives: Iterable[str | Path]) -> str:
+    """The model of the package for drives: "demo" if the calibration.json of each states that bevcli rendered it.
+
+    Otherwise "photographs", also for other formats, videos, URLs, a calibration that cannot be read, and no drive.
+    """
+    stated = [_is_rendered(Path(drive)) for drive in drives]
+    return RENDERED if stated and all(stated) else PHOTOGRAPHS
+
+
+def _is_rendered(drive: Path) -> bool:
+    try:
+        return draft_calibration(drive / CALIBRATION).facts.rendered
+    except (BevcliError, OSError):
+        return False
+
+
+def choose_model(options: ModelOptions, drives: Sequence[str | Path] | None) -> tuple[ModelOptions, tuple[str, ...]]:
+    """The options with `default_model` where they name neither a model nor weights, and a note if it is "photographs".
+
+    drives: paths and URLs of those that the model is to run on; None for rendered ones that are known by their seeds.
+    """
+    if options.model is not None or options.weights is not None:
+        return options, ()
+    name = RENDERED if drives is None else default_model(drives)
+    chosen = replace(options, model=name)
+    if name == RENDERED or not drives:
+        return chosen, ()
+    which = "the drive is no rendering" if len(drives) == 1 else "not all drives are renderings"
+    return chosen, (f"model {name}, as {which} of bevcli: `model` (`--model`) chooses another",)
+
+
 def weights_file(path_or_name: Path) -> Path:
     """The file at a path, or the weights of a name on this machine. Raises WeightsError for a name without a file."""
     name = str(path_or_name)
@@ -341,7 +380,7 @@ def weights_file(path_or_name: Path) -> Path:
 
 def weights_to_fetch(options: ModelOptions) -> NamedWeights | None:
     """The weights that `load_model` would download; None where there are none."""
-    name = str(options.model or DEFAULT_MODEL)
+    name = str(options.model or PHOTOGRAPHS)
     if not options.fetch or options.weights or options.untrained or bundled_weights(name):
         return None
     named = all_weights(options.weights_dir).get(name)

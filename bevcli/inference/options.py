@@ -8,6 +8,7 @@ from bevcli.model.precision import AnyPrecision
 from bevcli.options import option, options, parse_pairs
 from bevcli.registry import entries, known_models
 
+PHOTOGRAPHS, RENDERED = "photographs", "demo"  # models of the package: for real images, for rendered ones
 TORCH = "torch"  # the value of `engine` beside the registered engines
 EXPORTED_SUFFIX, FILE_ENGINE = ".onnx", "onnxruntime"  # of exported files, and the engine that runs them by default
 
@@ -29,7 +30,7 @@ class ModelOptions:
         default=None,
         help=f"{', '.join(known_models())}, a name of `bevcli weights list`, hf:OWNER/NAME[@REVISION] of the "
         "Hugging Face Hub, a FILE.toml or a FILE.onnx of `bevcli export-onnx`. Default: the model that WEIGHTS fit, "
-        "else demo.",
+        "else photographs, or demo where bevcli rendered the drive.",
         metavar="NAME|FILE",
         complete=complete_model,
     )

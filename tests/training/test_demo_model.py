@@ -52,11 +52,11 @@ def test_the_demo_model_is_trained_with_history() -> None:
     assert settings.weights_dtype == "float16"
 
 
-def test_its_weights_are_in_the_package_and_the_default() -> None:
-    loaded = load_model()
-    assert loaded.name == "demo"
+def test_its_weights_are_in_the_package() -> None:
+    loaded = load_model("demo")
     assert loaded.weights == bundled_weights("demo")
     assert loaded.bundled
+    assert load_model(untrained=True).name == "photographs"
 
 
 @pytest.mark.parametrize("name", ["tiny", "small", "base"])

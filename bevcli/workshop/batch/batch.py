@@ -3,14 +3,14 @@
 import contextlib
 import json
 from collections import Counter
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError, OutputError
-from bevcli.inference.load import Model, choose_device, load_model
+from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, spread
 from bevcli.recording.meshes import read_class_meshes
@@ -71,12 +71,22 @@ def batch(
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
     if "recording" not in options:
         run_options = replace(run_options, recording=recording)
+    batch_drives, notes = drives_of(list(map(str, texts)), batch_options, format_values)
+    model, more = choose_model(model, [drive.source for drive in batch_drives])
     job = job_of(batch_options, workers, model, run_options)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
-    prepared = prepare_batch(job, loaded, list(map(str, texts)), batch_options, workers, input_options, format_values)
+    prepared = prepare_batch(job, loaded, batch_drives, (*more, *notes), batch_options, workers, input_options, format_values)
     for _ in prepared.run():
         pass
     return prepared.summary
+
+
+def drives_of(
+    texts: Sequence[str], options: BatchOptions, format_values: Mapping[str, Any]
+) -> tuple[list[BatchDrive], tuple[str, ...]]:
+    """The drives of arguments and of the list in the options, and notes, as `find_drives`. Raises InputError."""
+    texts = [*texts, *(read_list(options.listed) if options.listed else ())]
+    return find_drives(texts, NuScenesOptions(format_values.get("version"), format_values.get("split")))
 
 
 def job_of(options: BatchOptions, workers: Workers, model: ModelOptions, run_options: RunOptions) -> Job:
@@ -104,16 +114,15 @@ def options_to_load(job: Job, workers: Workers, *, fetch: bool = False) -> Model
 def prepare_batch(
     job: Job,
     model: Model,
-    texts: list[str],
+    drives: Sequence[BatchDrive],
+    notes: tuple[str, ...],
     options: BatchOptions,
     workers: Workers,
     input_options: InputOptions,
     format_values: dict[str, Any],
 ) -> "Batch":
     """The batch of a job with its drives. format_values: options of formats by name. Raises InputError."""
-    texts = [*texts, *(read_list(options.listed) if options.listed else ())]
     others = {name: value for name, value in format_values.items() if name != "split"}
-    drives, notes = find_drives(texts, NuScenesOptions(format_values.get("version"), format_values.get("split")))
     if model.needs_export:
         notes = (*notes, OF_EXPORT)
     input_options = input_options.for_model(model.config, temporal=job.run.temporal)

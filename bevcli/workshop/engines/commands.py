@@ -21,7 +21,7 @@ def export_onnx(
         str | None,
         model_option(
             "tiny, small, base, demo, photographs, v2-t1-base, v2-t1, v2-t2, v2-t8, or a FILE.toml. Default: the model "
-            "that WEIGHTS fit, else demo."
+            "that WEIGHTS fit, else photographs."
         ),
     ] = None,
     *,

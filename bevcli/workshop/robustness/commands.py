@@ -40,12 +40,14 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
+    from bevcli.inference.load import choose_model
     from bevcli.workshop.robustness import conditions, stress as work
 
     chosen_conditions = conditions.choose_conditions(output.severity, output.only)
     other = None if options.against is None else work.read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
+    model, why = choose_model(model, sequence or None)
     loaded = load_with_bar(model)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
@@ -55,7 +57,7 @@ def stress(
     loaded = loaded.in_engine(drives[0].rig, drives[0], report=print_note)
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(chosen_conditions) * sum(len(drive.stamps) for drive in drives)
-    notes = [note for drive in drives for note in drive.notes]
+    notes = [*why, *(note for drive in drives for note in drive.notes)]
     test = work.StressTest(loaded, drives, chosen_conditions, out, options, force=output.force, resume=output.resume)
     with (
         Progress(total, "frames", notes) as progress,

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -99,7 +100,10 @@ def _run(trainer: "Trainer") -> None:
 def validate(
     model: Annotated[
         str | None,
-        model_option("A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else demo."),
+        model_option(
+            "A model name, a FILE.toml or a FILE.onnx. Default: the model that WEIGHTS fit, else photographs, or "
+            "demo where bevcli rendered all drives."
+        ),
     ] = None,
     *,
     model_options: Annotated[ModelOptions, Part(only=("weights", "device", "engine", "precision", "calibrate_with"))],
@@ -114,11 +118,13 @@ def validate(
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
     """
+    from bevcli.inference.load import choose_model
     from bevcli.workshop.training import train as work, validation
 
-    loaded = bevcli.load_model(model, options=model_options)
+    chosen, why = choose_model(replace(model_options, model=model), work.paths_to_score(drive_options))
+    loaded = bevcli.load_model(options=chosen)
     drives = last_of_steps(work.drives_to_score(loaded.config, model or loaded.name, drive_options, options))
-    notes = validation.check_scored_drives(drive_options, drives, loaded.config)
+    notes = (*why, *validation.check_scored_drives(drive_options, drives, loaded.config))
     if loaded.needs_export:
         loaded = loaded.in_engine(drives.open(0).rig, drives.open(0), report=print_note)
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
@@ -126,7 +132,7 @@ def validate(
     if not work.has_ground_truth(drives):
         beside = work.FolderDrives(() if options.reference is None else (options.reference,), loaded.config)
         total += work.count_frames(beside)
-        _estimate(loaded, [drives, beside], total, options, as_json=as_json, temporal=run_options.temporal)
+        _estimate(loaded, [drives, beside], total, options, why, as_json=as_json, temporal=run_options.temporal)
         return
     if options.reference is not None:
         raise InputError("--reference is for drives without ground truth: remove it")
@@ -138,11 +144,18 @@ def validate(
 
 
 def _estimate(
-    model: "Model", drives: "list[Drives]", frames: int, options: ValidationOptions, *, as_json: bool, temporal: bool
+    model: "Model",
+    drives: "list[Drives]",
+    frames: int,
+    options: ValidationOptions,
+    why: tuple[str, ...],
+    *,
+    as_json: bool,
+    temporal: bool,
 ) -> None:
     """Print the estimated score of each drive; none of them has ground truth.
 
-    drives: with those of a reference as the second item. frames: of all of them.
+    drives: with those of a reference as the second item. frames: of all of them. why: notes on the model.
     """
     from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
 
@@ -150,7 +163,10 @@ def _estimate(
         if is_set:
             raise InputError(f"{name}: needs ground truth, which no drive has: remove it")
     scores: list[tuple[str, EstimatedScore]] = []
-    notes = ("no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",)
+    notes = (
+        *why,
+        "no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",
+    )
     with Progress(frames, "frames", notes) as progress:
         for drive in (some.open(index) for some in drives for index in range(len(some))):
             score = estimate_score(model, drive, temporal=temporal, after_frame=progress.advance)

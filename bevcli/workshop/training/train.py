@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bevcli.inference.load import Model, choose_device, load_model
+from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.options import refuse, spread
@@ -15,6 +15,7 @@ from bevcli.workshop.synth.drives import (
     Drives,
     FolderDrives as FolderDrives,
     count_frames as count_frames,
+    read_split,
     scored_drives,
 )
 from bevcli.workshop.synth.options import DriveOptions
@@ -82,7 +83,7 @@ def validate(
         print(scores.table())
 
     Args:
-        model: a `Model`, or what `load_model` takes.
+        model: a `Model`, or what `load_model` takes. None: "demo" if bevcli rendered all drives, else "photographs".
         temporal: use the frames before (and after).
         options: those of `DriveOptions` (`data`, `rendered`, …) and `ValidationOptions` (`rig`, `max_range`,
             `tracking`, `each`); and of `ModelOptions` (`weights`, `device`, `engine`, …), where `model` is no `Model`.
@@ -92,10 +93,14 @@ def validate(
     of_model = () if isinstance(model, Model) else (ModelOptions,)
     drives, settings, *model_options, unknown = spread(options, DriveOptions, ValidationOptions, *of_model)
     refuse(unknown, "validate", DriveOptions, ValidationOptions, *of_model)
-    loaded = model if isinstance(model, Model) else load_model(model, options=model_options[0])
+    if isinstance(model, Model):
+        loaded, why = model, tuple[str, ...]()
+    else:
+        model_choice, why = choose_model(replace(model_options[0], model=model), paths_to_score(drives))
+        loaded = load_model(options=model_choice)
     name = loaded.name if model is None or isinstance(model, Model) else str(model)
     scored: Drives = deque[Any](drives_to_score(loaded.config, name, drives, settings), maxlen=1).pop()
-    notes = check_scored_drives(drives, scored, loaded.config)
+    notes = (*why, *check_scored_drives(drives, scored, loaded.config))
     if loaded.needs_export:
         loaded = loaded.in_engine(scored.open(0).rig, scored.open(0))
     runner = loaded.runner(StepOptions(track=settings.tracking, temporal=temporal))
@@ -117,6 +122,13 @@ def drives_to_score(
     if options.odometry:
         yield from drives.measure_motion()
     yield drives
+
+
+def paths_to_score(options: DriveOptions) -> tuple[Path, ...] | None:
+    """The drives of a validation, for `choose_model`: None for rendered ones. Raises InputError as `read_split`."""
+    if options.rendered is not None:
+        return None
+    return options.data if options.split is None else read_split(options.split).validate
 
 
 def has_ground_truth(drives: Drives) -> bool:
