@@ -51,8 +51,8 @@ def test_the_measured_road_is_that_of_each_frame() -> None:
     angle = np.radians(1.0)
     pitched = rigid((2, 0, 0), [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     aft = np.array([-np.sin(angle), 0, np.cos(angle)])
-    still = MeasuredStep(rigid((2, 0, 0)), np.eye(6), road_normal=aft)
-    steps = MeasuredStep(pitched, np.eye(6), road_normal=aft), still
+    still = MeasuredStep(rigid((2, 0, 0)), np.eye(6), road=aft)
+    steps = MeasuredStep(pitched, np.eye(6), road=aft), still
     motion = MeasuredMotion("brakes", np.arange(3, dtype=np.int64) * SECOND, steps).ego_motion
     for second, expected in enumerate([(0, 0, 1), aft, aft]):
         np.testing.assert_allclose(motion.road_normal_at(second * SECOND), expected, atol=1e-12)

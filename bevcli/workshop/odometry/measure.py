@@ -16,7 +16,17 @@ from bevcli.frame import Drive, Frame
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, RecentPoses, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.workshop.odometry import OdometryOptions
-from bevcli.workshop.odometry.step_views import COUNT, SLOPES, StepViews, exponential, logarithm, motion_of, next_slopes
+from bevcli.workshop.odometry.step_views import (
+    CHANGE_RAD,
+    COUNT,
+    SLOPE_RAD,
+    SLOPES,
+    StepViews,
+    exponential,
+    logarithm,
+    motion_of,
+    next_slopes,
+)
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, SeenPoints, candidates, is_measured, reason_of
 from bevcli.workshop.odometry.views import FrameView, Viewer
 
@@ -28,6 +38,7 @@ BEYOND_NS = 100_000_000  # of constant velocity before the first and after the l
 ROCKING, TURNING, SPEEDING = np.radians(3.0), np.radians(15.0), 4.0
 LASTING = 0.75  # share of a slope that the next step expects: else an error of slopes would grow from step to step
 UNKNOWN = 4.0  # factor of the deviations of a guess where nothing was measured before
+UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,12 @@ class MeasuredStep:
     matches: int = 0  # number of matched points that were used
     road_points: int = 0  # number of points of the road that were used
     seen: SeenPoints | None = None  # some of both, for recordings; None where nothing was measured
-    road_normal: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) up, ego frame of the second
+    road: Array = field(default_factory=UP.copy)  # (3,) up from the road, ego frame of the second; longer if surer
+
+    @property
+    def road_normal(self) -> Array:
+        """(3,) unit vector that points up from the road, ego frame of the second frame."""
+        return self.road / np.linalg.norm(self.road)
 
     @property
     def deviations(self) -> Array:
@@ -173,6 +189,7 @@ class MotionMeter:
         self._before: tuple[Array, float] | None = None  # the state of the step before and its seconds
         self._seconds, self._guessed = 0.0, 0  # of the step that is not decided; guesses in a row
         self._sure: tuple[Candidate, float] | None = None  # the measured step before that one, and its seconds
+        self._road = np.zeros(3)  # of the last step that is certain
 
     def add(self, frame: Frame) -> list[MeasuredStep]:
         """The steps that are certain now: of the frame before at the latest."""
@@ -185,7 +202,7 @@ class MotionMeter:
         motions = candidates(step, Guess(self._expected(seconds), self._options.height_m))
         if not motions:
             before, self._guessed = self.finish(), self._guessed + 1
-            return [*before, self._guess(seconds, reason_of(step))]
+            return [*before, self._keep(self._guess(seconds, reason_of(step)))]
         decided = self._chain.add(motions, seconds)
         likeliest = self._chain.likeliest
         assert likeliest is not None
@@ -214,16 +231,34 @@ class MotionMeter:
             if leaps(before[0], candidate, after[0], lasted):
                 self._before, self._sure = (before[0].state, before[1]), None
                 self._guessed += 1
-                return self._guess(self._seconds, LEAPS)
+                return self._keep(self._guess(self._seconds, LEAPS))
         self._guessed = 0 if is_measured(candidate) else self._guessed + 1
-        return self._step(candidate)
+        return self._keep(self._step(candidate))
+
+    def _keep(self, step: MeasuredStep) -> MeasuredStep:
+        """A step that is certain."""
+        self._road = step.road
+        return step
 
     def _step(self, candidate: Candidate) -> MeasuredStep:
         """A motion as measured, or a guess where the images do not tell it."""
         if not is_measured(candidate):
             return self._guess(self._seconds, NOT_TOLD)
         of_points = candidate.matches, candidate.road_points, candidate.seen
-        return MeasuredStep(motion_of(candidate.state), candidate.covariance, "", *of_points, _normal(candidate.state))
+        road = self._road_after(candidate.state, self._seconds, candidate.slopes_told)
+        return MeasuredStep(motion_of(candidate.state), candidate.covariance, "", *of_points, road)
+
+    def _road_after(self, state: Array, seconds: float, told: float = 0.0) -> Array:
+        """`MeasuredStep.road` of a step: what the step tells of it, and the last one, carried along by its turn.
+
+        The road changes with the way. Each second also tells a little that the vehicle stands on it without a tilt: so
+        where the slope was never seen, it is that of the mean so far.
+        """
+        up = seconds / 2 * UP
+        carried = motion_of(state)[:3, :3].T @ (self._road + up)
+        way_m = min(float(np.hypot(*state[3:5])), 1.0)
+        carried /= 1 + np.linalg.norm(carried) * way_m * (CHANGE_RAD / SLOPE_RAD) ** 2
+        return np.asarray(carried + up + told * _normal(state))
 
     def _expected(self, seconds: float) -> Array | None:
         """(8,) the state of a step at constant velocity."""
@@ -239,7 +274,7 @@ class MotionMeter:
         wide = seconds * np.sqrt(max(1, self._guessed)) if state is not None else seconds * UNKNOWN
         deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
         state = np.zeros(COUNT - 1) if state is None else state
-        return MeasuredStep(motion_of(state), np.diag(deviations**2), reason, road_normal=_normal(state))
+        return MeasuredStep(motion_of(state), np.diag(deviations**2), reason, road=self._road_after(state, seconds))
 
 
 def _normal(state: Array) -> Array:

@@ -100,6 +100,7 @@ class Candidate:
     matches: int  # number of matched points
     road_points: int  # number of points of the road
     seen: SeenPoints | None = None  # some of both
+    slopes_told: float = 0.0  # the information of the images about the slopes of the road; 1 for SLOPE_RAD
 
     def speed_and_rate(self, seconds: float) -> Array:
         """(2,) the speed (m/s, negative backwards) and the yaw rate (radians a second) of a step of some seconds."""
@@ -252,7 +253,10 @@ def measured(
         step.second.cameras,
         *((step.pair(term.group)[1], term.rays_b, values(unknowns, term, solution.x)) for term in (fitting, road)),
     )
-    return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen)
+    nominal = np.linalg.inv(solution.information + np.diag(1 / deviations**2))
+    told = float(SLOPE_RAD**2 * (1 / nominal.diagonal()[SLOPES].max() - 1 / deviations[SLOPES].max() ** 2))
+    told *= min(float(np.hypot(*state[3:5])) / SHORTEST_M, 1.0) ** 2  # a vehicle that creeps is surer than it may be
+    return Candidate(state, motion, votes, len(fitting.group), len(road.group), seen, told)
 
 
 def _terms(step: StepViews, unknowns: StepUnknowns, residuals: tuple[Residuals, ...], x: Array) -> list[Term]:
