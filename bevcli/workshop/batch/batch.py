@@ -75,7 +75,9 @@ def batch(
     model, more = choose_model(model, [drive.source for drive in batch_drives])
     job = job_of(batch_options, workers, model, run_options)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
-    prepared = prepare_batch(job, loaded, batch_drives, (*more, *notes), batch_options, workers, input_options, format_values)
+    prepared = prepare_batch(
+        job, loaded, batch_drives, (*more, *notes), batch_options, workers, input_options, format_values
+    )
     for _ in prepared.run():
         pass
     return prepared.summary
