@@ -15,6 +15,19 @@ from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, bra
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 
+# Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
+GROUPS = {
+    **dict.fromkeys(("car", "bus", "truck", "trailer"), 1),
+    **dict.fromkeys(("person", "pedestrian"), 2),
+    **dict.fromkeys(("bicycle", "motorcycle"), 3),
+}
+MISSED = (
+    0.0,
+    -1.1,
+    -1.9,
+    -1.1,
+)  # logarithms of the shares that it misses: of rendered cars a third, of people a seventh
+MARGIN, SURE = 0.15, 0.3  # of the sides of a box, in which an object's centre lies; score that counts as found
 RANGE_SCALE = 0.05  # of metres, as they enter a layer
 
 
@@ -24,17 +37,17 @@ class HybridQueriesConfig:
 
     Attributes:
         count: of queries, the best boxes of all cameras; 0 for none.
-        layers: that correct them.
+        layers: that correct them by the BEV map; with 0 they stay as `Lift` gives them.
         features: channels of the backbone's maps.
     """
 
     count: int = 0
-    layers: int = 2
+    layers: int = 0
     features: int = 128
 
     def __post_init__(self) -> None:
-        if self.count < 0 or self.layers < 1 or self.features < 1:
-            raise ValueError("count must be 0 or more, layers and features 1 or more")
+        if self.count < 0 or self.layers < 0 or self.features < 1:
+            raise ValueError("count and layers must be 0 or more, features 1 or more")
 
 
 class HybridQueries(nn.Module):
@@ -42,6 +55,9 @@ class HybridQueries(nn.Module):
 
     range_start: Tensor
     range_extent: Tensor
+    of_image: Tensor  # (7, groups)
+    of_class: Tensor  # (classes, groups)
+    missed: Tensor  # (groups,)
 
     def __init__(
         self,
@@ -56,14 +72,18 @@ class HybridQueries(nn.Module):
         super().__init__()
         self.config, shape = config, (grid.rows, grid.columns)
         self.lift = Lift(LiftConfig(), classes, config.features, -height_m)
-        self.content = nn.Linear(config.features + len(IMAGE_CLASSES) + len(classes), channels)
-        self.position = branch(BOX_CODE_SIZE, 1, channels)
         self.layers = nn.ModuleList(DecoderLayer(decoder, channels, shape) for _ in range(config.layers))
-        self.class_correction = nn.Linear(channels, len(classes))
-        self.box_correction = nn.Linear(channels, BOX_CODE_SIZE)
-        for last in (self.class_correction, self.box_correction):
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        if config.layers:
+            self.content = nn.Linear(config.features + len(IMAGE_CLASSES) + len(classes), channels)
+            self.position = branch(BOX_CODE_SIZE, 1, channels)
+            self.class_correction = nn.Linear(channels, len(classes))
+            self.box_correction = nn.Linear(channels, BOX_CODE_SIZE)
+            for weights in (*self.class_correction.parameters(), *self.box_correction.parameters()):
+                nn.init.zeros_(weights)
+        of_image, of_class = ([GROUPS.get(name, 0) for name in names] for names in (IMAGE_CLASSES, classes))
+        self.register_buffer("of_image", torch.eye(len(MISSED))[of_image], persistent=False)
+        self.register_buffer("of_class", torch.eye(len(MISSED))[of_class], persistent=False)
+        self.register_buffer("missed", torch.tensor(MISSED), persistent=False)
         ranges = torch.tensor([grid.x_range_m, grid.y_range_m])
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
         self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
@@ -85,9 +105,34 @@ class HybridQueries(nn.Module):
             count = min(self.config.count, logits.shape[1])
             index = logits.amax(-1).topk(count).indices
             logits, codes, place = rows(logits, index), rows(codes, index), rows(place, index).clamp(0, 1)
-            seen = rows(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), index)
+        if not self.config.layers:
+            return logits, codes
+        seen = rows(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), index)
         query = self.content(torch.cat([seen, logits], -1))
         position = self.position(torch.cat([codes[..., :2] * RANGE_SCALE, codes[..., 2:]], -1))
         for layer in self.layers:
             query = layer(query, position, place, bev)
         return logits + self.class_correction(query), codes + self.box_correction(query)
+
+    def weighed(
+        self, class_logits: Tensor, box_codes: Tensor, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor
+    ) -> Tensor:
+        """The class logits (L, B, Q, classes) of other queries, lower where the detector looked and saw nothing.
+
+        An object that a camera sees and its detector does not is one of those that it misses, or none: by Bayes' rule
+        the logit falls by the logarithm of the share that it misses. box_codes: (L, B, Q, 10). Others: see `forward`.
+        """
+        x, y, _, _, z, *_ = box_codes[-1].float().unbind(-1)
+        center = torch.stack([x, y, z], -1)[:, None]  # (B, 1, Q, 3)
+        pixel = center @ image_from_bev[..., :3, :3].transpose(-1, -2) + image_from_bev[..., None, :3, 3]
+        place = pixel[..., :2] / pixel[..., 2:].clamp(min=0.1)  # (B, N, Q, 2)
+        is_seen = (pixel[..., 2] > 1) & (place > 0).all(-1) & (place < sizes[:, :, None]).all(-1)
+        is_seen = is_seen & (
+            boxes.scores.amax(-1, keepdim=True) > 0
+        )  # an image in which nothing is found tells nothing
+        start, end = boxes.boxes[:, :, None].split(2, -1)  # (B, N, 1, K, 2)
+        margin = MARGIN * (end - start)
+        hit = ((place[..., None, :] > start - margin) & (place[..., None, :] < end + margin)).all(-1)  # (B, N, Q, K)
+        sureness = (boxes.scores / SURE).clamp(max=1)[:, :, None] * hit
+        found = (sureness[..., None] * self.of_image[boxes.labels][:, :, None]).amax((1, 3))  # (B, Q, groups)
+        return class_logits + (self.missed * (1 - found) * is_seen.any(1)[..., None]) @ self.of_class.T

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_model import small_config, small_inputs
+from small_model import HEIGHT, WIDTH, small_config, small_inputs
 
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.model.hybrid_queries import HybridQueriesConfig
+from bevcli.model.hybrid_queries import GROUPS, HybridQueriesConfig
+from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
 from bevcli.model.lift import NO_BOX
 from bevcli.model.nanodet import NanoDetConfig
 
@@ -18,7 +19,7 @@ COUNT = 20
 def model():
     config, backbone = small_config(), NanoDetConfig(max_boxes=16)
     hybrid = HybridQueriesConfig(COUNT, layers=1)
-    torch.manual_seed(1)
+    torch.manual_seed(1)  # some boxes are inside the grid
     return BEVFormer(
         replace(config, backbone=backbone, neck=replace(config.neck, levels=2), hybrid_queries=hybrid)
     ).eval()
@@ -48,10 +49,20 @@ def test_without_training_they_are_the_lifted_boxes(model):
 
 
 @torch.no_grad()
-def test_the_learned_queries_stay_as_they_are(model):
-    inputs, queries = small_inputs(), model.config.decoder.queries
-    alone = model.detect(model(inputs).bev)
-    assert torch.equal(model(inputs).class_logits[:, :, :queries], alone.class_logits)
+def test_a_learned_query_loses_where_the_detector_looked_and_saw_nothing(model):
+    """Two cars that one camera sees, one of them in a box of a car; a cone, and a car that no camera sees."""
+    hybrid, classes = model.hybrid_queries, len(model.config.classes)
+    logits, codes = torch.zeros(1, 1, 3, classes), torch.zeros(1, 1, 3, 10)
+    codes[0, 0, :, :2] = torch.tensor([[0.0, 10.0], [5.0, 10.0], [20.0, 1.0]])
+    camera = torch.tensor([[WIDTH / 2, WIDTH / 2, 0, 0], [0, HEIGHT / 2, -HEIGHT, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    middle = torch.tensor([WIDTH / 2, HEIGHT / 2] * 2)
+    box = middle + torch.tensor([-4.0, -4, 4, 4])
+    numbers = [box.view(1, 1, 1, 4), torch.full((1, 1, 1), 0.9), torch.full((1, 1, 1), IMAGE_CLASSES.index("car"))]
+    boxes = ImageBoxes(*numbers, *[torch.zeros(1, 1, 1, size) for size in (7, 128, 3)])
+    changed = hybrid.weighed(logits, codes, boxes, camera.view(1, 1, 4, 4), torch.tensor([[[WIDTH, HEIGHT]]]))[0, 0]
+    car = model.config.classes.index("car")
+    assert changed[:, car].tolist() == pytest.approx([0.0, -1.1, 0.0])
+    assert all(changed[:, i].abs().max() == 0 for i, name in enumerate(model.config.classes) if name not in GROUPS)
 
 
 @torch.no_grad()

@@ -5,9 +5,9 @@
     python tests/tools/lift.py OUT --detector OUT/nanodet.safetensors --material OUT/material \
         [--drives 700000:700060] [--steps 1500] [--seed 0]
 
-1. Six frames of each drive, with random rigs and varied looks, are rendered and passed to the detector. Its boxes and the
-   objects that they show go to OUT/boxes/SEED.pt; drives that are there already are used, so that it may be stopped.
-2. The lift learns from them as if each vehicle had pitched and rolled, grounds were rough, and objects differed in size.
+1. Six frames of each drive, with random rigs and varied looks, are rendered and passed to the detector. Its boxes and
+   the objects that they show go to OUT/boxes/SEED.pt; drives that are there already are used, so that it may be stopped.
+2. The lift learns from them as if each vehicle had pitched and rolled, grounds were rough, and sizes differed.
 
 Weights: OUT/lift.safetensors. One thread takes 15 s for a drive, and 50 ms for a step.
 """
@@ -179,14 +179,15 @@ def spoiled(pixels: np.ndarray, quality: int, random: np.random.Generator) -> np
 def boxes_of(drive: RenderedDrive, index: int) -> Boxes3D:
     """The objects of a frame in the order in which `RenderedView.objects` counts them, world frame."""
     states = [state for _, state in drive._actors(index)]
-    sizes, centers = (np.stack([getattr(x, n) for x in many]) for many, n in (([s.body for s in states], "size_lwh"), (states, "position")))  # fmt: skip
+    sizes = np.stack([state.body.size_lwh for state in states])
+    centers = np.stack([state.position for state in states])
     centers = centers + sizes * [0, 0, 0.5]
     names = np.array([state.body.variant.class_name for state in states])
     return Boxes3D(centers, sizes, np.array([s.yaw for s in states]), np.stack([s.velocity for s in states]), names)
 
 
 def visible_parts(objects: np.ndarray, camera: Any, scale: float, count: int) -> Tensor:
-    """(count, 4) rectangle around what is seen of each object, pixels of the network's input; NaN where it is hidden."""
+    """(count, 4) rectangle around what is seen of each object, pixels of the network's input; NaN if hidden."""
     if camera.distortion is not None:
         u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
         u, v = np.nan_to_num(np.moveaxis(camera.distorted(np.stack([u, v], -1)), -1, 0), nan=-9.0).astype(np.float32)
@@ -293,7 +294,7 @@ def bev_from_level(pitch: Tensor, roll: Tensor, ground_z: float = -1.84) -> Tens
 
 
 def loss(lift: Lift, frames: dict[str, Tensor]) -> Tensor:
-    """How far boxes are off, and how wrong their scores are: a box is as right as the AP says, at its four distances."""
+    """How far boxes are off, and how wrong their scores are: a box is as right as the AP says at four distances."""
     parts = ("boxes", "scores", "labels", "logits", "features")
     found = ImageBoxes(
         *(frames[key].float() if key == "features" else frames[key] for key in parts), cells=frames["boxes"]

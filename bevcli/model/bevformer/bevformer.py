@@ -121,8 +121,10 @@ class BEVFormer(Network):
         outputs = self.detect(bev)
         if self.hybrid_queries is not None and boxes is not None:
             with without_autocast(bev.device):
-                cameras = inputs.image_from_bev, inputs.image_sizes
-                outputs = outputs.with_queries(*self.hybrid_queries(bev.float(), boxes, *cameras))
+                cameras = boxes, inputs.image_from_bev, inputs.image_sizes
+                logits = self.hybrid_queries.weighed(outputs.class_logits, outputs.box_codes, *cameras)
+                outputs = replace(outputs, class_logits=logits)
+                outputs = outputs.with_queries(*self.hybrid_queries(bev.float(), *cameras))
         return replace(outputs, image_boxes=boxes)
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
