@@ -6,7 +6,7 @@
         [--drives 700000:700060] [--steps 1500] [--seed 0]
 
 1. Six frames of each drive, with random rigs and varied looks, are rendered and passed to the detector. Its boxes and
-   the objects that they show go to OUT/boxes/SEED.pt; drives that are there already are used, so that it may be stopped.
+   the objects that they show go to OUT/boxes/SEED.pt; drives that are there are used, so that it may be stopped.
 2. The lift learns from them as if each vehicle had pitched and rolled, grounds were rough, and sizes differed.
 
 Weights: OUT/lift.safetensors. One thread takes 15 s for a drive, and 50 ms for a step.
