@@ -139,6 +139,7 @@ def inputs(frame: int, config: ModelConfig, *, all_frames: bool = False) -> Mode
         image_from_bev=torch.from_numpy(image_from_bev(frame, config)).float()[None],
         camera_index=torch.arange(len(config.cameras)),
         has_image=torch.ones(1, len(config.cameras), dtype=torch.bool),
+        image_sizes=torch.tensor(config.image.size, dtype=torch.float32).expand(1, len(config.cameras), 2),
         can_bus=torch.from_numpy(moved.can_bus)[None],
         shift=torch.from_numpy(moved.shift)[None],
         rotation_deg=torch.tensor([moved.rotation_deg]),

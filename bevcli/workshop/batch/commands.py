@@ -58,13 +58,12 @@ def batch(
     drive), report.html and, with --eval, metrics.json. A drive that fails after all retries becomes a row with its
     error, and the others go on. Exit code 3: some drives failed. See docs/fleet.md.
     """
-    from bevcli.inference.load import choose_model
     from bevcli.workshop.batch import batch as work
 
     if options.retry_failed and not options.resume:
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
     found, notes = work.drives_of(drives or [], options, format_options)
-    model, more = choose_model(model, [drive.source for drive in found])
+    model, more = work.choose_model(model, [drive.source for drive in found])
     job = work.job_of(options, workers, model, replace(run_options, recording=recording))
     loaded = load_with_bar(work.options_to_load(job, workers, fetch=model.fetch))
     summary = _run(work.prepare_batch(job, loaded, found, (*more, *notes), options, workers, source, format_options))

@@ -118,10 +118,9 @@ def validate(
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
     """
-    from bevcli.inference.load import choose_model
     from bevcli.workshop.training import train as work, validation
 
-    chosen, why = choose_model(replace(model_options, model=model), work.paths_to_score(drive_options))
+    chosen, why = work.choose_model(replace(model_options, model=model), work.paths_to_score(drive_options))
     loaded = bevcli.load_model(options=chosen)
     drives = last_of_steps(work.drives_to_score(loaded.config, model or loaded.name, drive_options, options))
     notes = (*why, *validation.check_scored_drives(drive_options, drives, loaded.config))
