@@ -128,10 +128,10 @@ def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[st
         notes.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
     notes += model.training_notes(drive.rig)
     if model.bundled and not drive.facts.rendered:
-        more = "" if model.name == PHOTOGRAPHS else f"; `--model {PHOTOGRAPHS}` finds more on photographs"
-        notes.append(
-            f"these weights were trained on rendered streets, not on the real world{more} (docs/model-card.md)"
-        )
+        learned = f"these weights were trained on rendered streets; `--model {PHOTOGRAPHS}` finds more on photographs"
+        if model.name == PHOTOGRAPHS:
+            learned = "near cars and people are found as in photographs, all else as learned from rendered streets"
+        notes.append(f"{learned} (docs/model-card.md)")
     return notes
 
 
