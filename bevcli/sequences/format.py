@@ -27,14 +27,15 @@ FEW = 4  # names in a message
 class Format:
     """An input format: a dataclass of its own options, which says how a path is recognised, and opens it with them.
 
-    Class attributes:
-        name: with an article, for messages: "a nuScenes root".
-        expected: the files that it is recognised by, for messages: "v1.0-*/scene.json".
-        reader: name of what opens a path, "module:attribute", which is imported when it is needed; see `open`.
-        annotated: whether its drives may have ground truth that opening them reads, so that `bevcli eval` takes them.
-        has_poses: whether its drives may have poses; without them, `bevcli run` uses no history.
-        precedence: the format with the highest one is taken where several recognise a path. A format that needs little
-            to recognise a path has a low one.
+    Each class states:
+
+    - name: with an article, for messages: "a nuScenes root".
+    - expected: the files that it is recognised by, for messages: "v1.0-mini/scene.json".
+    - reader: name of what opens a path, "module:attribute", which is imported when it is needed; see `open`.
+    - annotated: whether its drives may have ground truth that opening them reads, so that `bevcli eval` takes them.
+    - has_poses: whether its drives may have poses; without them, `bevcli run` uses no history.
+    - precedence: the format with the highest one is taken where several recognise a path. A format that needs little to
+      recognise a path has a low one.
     """
 
     name: ClassVar[str]
