@@ -134,7 +134,7 @@ def save_state(path: Path, state: object) -> None:
 def load_state(path: Path, cls: type[Loaded]) -> Loaded:
     """Read a state that `save_state` wrote; tensors are on the CPU.
 
-    kind: the type of the state. Its dataclasses state the type of every field.
+    cls: the type of the state. Its dataclasses state the type of every field.
     Raises InputError for a changed or damaged file, and for a state of another type.
     """
     written = read_bytes(path, LARGEST_BYTES)
