@@ -262,6 +262,11 @@ class ModelConfig:
         return tuple(MAP_CLASSES) if "segmentation" in self.heads else ()
 
     @property
+    def object_queries(self) -> int:
+        """The number of object queries, learned and hybrid ones, that the model's boxes come from."""
+        return self.decoder.queries + self.hybrid_queries.count
+
+    @property
     def image_classes(self) -> tuple[str, ...]:
         """The classes of the boxes in the images, in the order of their labels; empty without a detector."""
         return IMAGE_CLASSES if isinstance(self.backbone, NanoDetConfig) else ()

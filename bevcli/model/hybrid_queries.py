@@ -8,12 +8,14 @@ boxes; what the layers read of the BEV map (the ground, other cameras, the histo
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, branch
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig
+from bevcli.model.pillar_projection import project_points
 
 # Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
 GROUPS = {
@@ -21,12 +23,8 @@ GROUPS = {
     **dict.fromkeys(("person", "pedestrian"), 2),
     **dict.fromkeys(("bicycle", "motorcycle"), 3),
 }
-MISSED = (
-    0.0,
-    -1.1,
-    -1.9,
-    -1.1,
-)  # logarithms of the shares that it misses: of rendered cars a third, of people a seventh
+# Logarithms of the shares that it misses, by group: of rendered cars a third, of people a seventh.
+MISSED = (0.0, -1.1, -1.9, -1.1)
 MARGIN, SURE = 0.15, 0.3  # of the sides of a box, in which an object's centre lies; score that counts as found
 RANGE_SCALE = 0.05  # of metres, as they enter a layer
 
@@ -102,12 +100,16 @@ class HybridQueries(nn.Module):
             place = (codes[..., :2] - self.range_start) / self.range_extent
             is_inside = ((place > 0) & (place < 1)).all(-1, keepdim=True)
             logits = logits.where(is_inside, NO_BOX)
-            count = min(self.config.count, logits.shape[1])
-            index = logits.amax(-1).topk(count).indices
-            logits, codes, place = rows(logits, index), rows(codes, index), rows(place, index).clamp(0, 1)
+            missing = max(self.config.count - logits.shape[1], 0)  # of few cameras
+            logits, codes, place = (
+                F.pad(x, (0, 0, 0, missing), value=fill) for x, fill in ((logits, NO_BOX), (codes, 0.0), (place, 0.0))
+            )
+            best, index = logits.amax(-1).topk(self.config.count)
+            logits, codes = rows(logits, index), rows(codes, index).where(best[..., None] > NO_BOX, 0.0)
+            place = rows(place, index).clamp(0, 1)
         if not self.config.layers:
             return logits, codes
-        seen = rows(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), index)
+        seen = rows(F.pad(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), (0, 0, 0, missing)), index)
         query = self.content(torch.cat([seen, logits], -1))
         position = self.position(torch.cat([codes[..., :2] * RANGE_SCALE, codes[..., 2:]], -1))
         for layer in self.layers:
@@ -123,13 +125,10 @@ class HybridQueries(nn.Module):
         the logit falls by the logarithm of the share that it misses. box_codes: (L, B, Q, 10). Others: see `forward`.
         """
         x, y, _, _, z, *_ = box_codes[-1].float().unbind(-1)
-        center = torch.stack([x, y, z], -1)[:, None]  # (B, 1, Q, 3)
-        pixel = center @ image_from_bev[..., :3, :3].transpose(-1, -2) + image_from_bev[..., None, :3, 3]
-        place = pixel[..., :2] / pixel[..., 2:].clamp(min=0.1)  # (B, N, Q, 2)
-        is_seen = (pixel[..., 2] > 1) & (place > 0).all(-1) & (place < sizes[:, :, None]).all(-1)
-        is_seen = is_seen & (
-            boxes.scores.amax(-1, keepdim=True) > 0
-        )  # an image in which nothing is found tells nothing
+        centers = torch.stack([x, y, z], -1)[:, None]  # (B, 1, Q, 3)
+        place, depth = project_points(image_from_bev[:, :, None], centers)  # (B, N, Q, 2), (B, N, Q)
+        tells = boxes.scores.amax(-1, keepdim=True) > 0  # an image in which nothing at all is found tells nothing
+        is_seen = tells & (depth > 1) & (place > 0).all(-1) & (place < sizes[:, :, None]).all(-1)
         start, end = boxes.boxes[:, :, None].split(2, -1)  # (B, N, 1, K, 2)
         margin = MARGIN * (end - start)
         hit = ((place[..., None, :] > start - margin) & (place[..., None, :] < end + margin)).all(-1)  # (B, N, Q, K)

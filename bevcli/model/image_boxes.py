@@ -88,7 +88,7 @@ def best_image_boxes(
     boxes = torch.minimum(rows(boxes, chosen), limit).clamp(min=-0.5)
     cell = cell.gather(1, chosen)
     found = (
-        *(boxes, scores, labels.gather(1, chosen), rows(numbers[..., :classes], chosen)),
+        *(boxes, scores, labels.gather(1, chosen), rows(numbers, chosen)[..., :classes]),
         *(features_at(maps, cell), grid[cell]),
     )
     return ImageBoxes(*(x.unflatten(0, has_image.shape) for x in found))

@@ -91,7 +91,7 @@ class Lift(nn.Module):
         distances = rays.distances(mean)
         extent = (boxes[..., 2:] - boxes[..., :2]).clamp(min=1.0)
         room = torch.cat([boxes[..., :2] + 0.5, limit - boxes[..., 2:]], -1)  # to the sides of the image
-        aspect = (rays.chord / rays.rise).clamp(0.1, 10).log()
+        aspect = (rays.chord / rays.rise).clamp(0.1, 10.0).log()
         of_image = [(room / 8).clamp(max=1), extent.log() - 4, aspect[..., None], hidden_feet(boxes, scores)[..., None]]
         seen = torch.cat([*of_image, logits / 3], -1)
         slopes, covariance = self._slopes(seen, scores, rays, distances)

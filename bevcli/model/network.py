@@ -1,6 +1,7 @@
 """The base of the published models: the parts that they share, in the order of the paper's figure 2."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -79,6 +80,22 @@ class Network(TemporalModel):
             if self.segmentation_head is not None:
                 segmentation = self.segmentation_head(bev.float(), self.bev_queries.position())
         return ModelOutputs(bev, class_logits, box_codes, segmentation)
+
+    def detect_with_images(
+        self, bev: Tensor, maps: list[Tensor], has_image: Tensor, image_from_bev: Tensor, image_sizes: Tensor
+    ) -> ModelOutputs:
+        """As `detect`, with the boxes in the images, and the queries that start from them, where the model has these.
+
+        maps: of `image_maps`. Others: see `ModelInputs`.
+        """
+        outputs = self.detect(bev)
+        boxes, cameras = self.backbone.image_boxes(maps, has_image, image_sizes), (image_from_bev, image_sizes)
+        if self.hybrid_queries is not None and boxes is not None:
+            with without_autocast(bev.device):
+                logits = self.hybrid_queries.weighed(outputs.class_logits, outputs.box_codes, boxes, *cameras)
+                hybrid = self.hybrid_queries(bev.float(), boxes, *cameras)
+                outputs = replace(outputs, class_logits=logits).with_queries(*hybrid)
+        return replace(outputs, image_boxes=boxes)
 
     def history_of_clip(self, clip: Clip, frame: int, memory: Any) -> Any:
         """The memory after a frame of training clips that is history only; None before the first frame. No gradient."""

@@ -156,7 +156,7 @@ class ModelOutputs:
     @classmethod
     def ports(cls, config: ModelConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
         """Name, shape and meaning of each output of an exported file, see `by_name`."""
-        cells, queries = config.bev_grid.rows * config.bev_grid.columns, config.decoder.queries
+        cells, queries = config.bev_grid.rows * config.bev_grid.columns, config.object_queries
         yield (
             "bev",
             (1, cells, config.channels),

@@ -1,4 +1,4 @@
-"""A model on a detector as an exported file: its features, and its boxes in the images, in float32 and INT8."""
+"""A model on a detector as an exported file: features, boxes in images, hybrid queries, in float32 and INT8."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytest.importorskip("openvino")
 @pytest.fixture(scope="module")
 def model():
     """Random weights of a size that gives boxes with scores of all sizes."""
-    model = model_for_engines(NanoDetConfig())
+    model = model_for_engines(NanoDetConfig(), hybrid_queries=20)
     with torch.random.fork_rng():
         torch.manual_seed(1)
         state = NanoDetConfig().build().state_dict()

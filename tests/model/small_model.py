@@ -15,6 +15,7 @@ from bevcli.model.decoder import DecoderConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.hybrid_queries import HybridQueriesConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
@@ -58,7 +59,9 @@ def small_model(seed: int = 0, **changes: object) -> BEVFormer:
 FAST_BACKBONE = ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), deformable_stages=(), width=8)
 
 
-def model_for_engines(backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = FAST_BACKBONE) -> BEVFormer:
+def model_for_engines(
+    backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = FAST_BACKBONE, hybrid_queries: int = 0
+) -> BEVFormer:
     """A small model without deformable convolutions, which OpenVINO lacks; duplicates of its boxes merge and fade."""
     return small_model(
         encoder=replace(small_config().encoder, layers=1),
@@ -66,6 +69,7 @@ def model_for_engines(backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetC
         backbone=backbone,
         neck=FPNConfig(levels=2),
         image_tokens=ImageTokensConfig(level_embeddings=2, calibration_embedding=True),
+        hybrid_queries=HybridQueriesConfig(hybrid_queries),
     )
 
 

@@ -78,6 +78,20 @@ def test_nothing_comes_of_cameras_without_images_and_of_places_outside_the_grid(
     assert found.sum() == min(inside, COUNT)
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("layers", [0, 1])
+def test_few_cameras_give_as_many_queries_some_of_them_empty(layers):
+    backbone, hybrid = NanoDetConfig(max_boxes=4), HybridQueriesConfig(COUNT, layers)
+    config = small_config()
+    neck = replace(config.neck, levels=2)
+    model = BEVFormer(replace(config, backbone=backbone, neck=neck, hybrid_queries=hybrid)).eval()
+    outputs = model(small_inputs())
+    logits, codes = (x[-1, 0, config.decoder.queries :] for x in (outputs.class_logits, outputs.box_codes))
+    assert len(logits) == len(codes) == COUNT
+    assert (logits[8:] == NO_BOX).all()
+    assert not codes[8:].any()
+
+
 def test_corrections_learn_from_the_bev_map(model):
     """The lift stays as it is; all else of the hybrid queries has a gradient once the last layers are not zero."""
     hybrid = model.hybrid_queries

@@ -13,7 +13,7 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
-from bevcli.model.upload import on_device, upload, upload_together, without_autocast
+from bevcli.model.upload import on_device, upload, upload_together
 
 
 @dataclass(frozen=True)
@@ -117,15 +117,7 @@ class BEVFormer(Network):
         )
         if not heads:
             return bev
-        boxes = self.backbone.image_boxes(maps, inputs.has_image, inputs.image_sizes)
-        outputs = self.detect(bev)
-        if self.hybrid_queries is not None and boxes is not None:
-            with without_autocast(bev.device):
-                cameras = boxes, inputs.image_from_bev, inputs.image_sizes
-                logits = self.hybrid_queries.weighed(outputs.class_logits, outputs.box_codes, *cameras)
-                outputs = replace(outputs, class_logits=logits)
-                outputs = outputs.with_queries(*self.hybrid_queries(bev.float(), *cameras))
-        return replace(outputs, image_boxes=boxes)
+        return self.detect_with_images(bev, maps, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
         """See `TemporalModel`."""

@@ -56,7 +56,7 @@ class WindowStep(ExportedStep):
             maps[index] = torch.where(has_image[:, index].any(), maps[index], maps[index + 1])
         bev = maps[0] if network.fusion is None else network.fusion(maps)
         most_cameras = torch.cat([frame_hits.most_cameras for frame_hits in hits]).amax(0, keepdim=True)
-        outputs = self.outputs(bev, most_cameras)
+        outputs = self.outputs(network.detect(bev), most_cameras)
         return outputs if previous_features is None else (*outputs, image_features.tokens)
 
 

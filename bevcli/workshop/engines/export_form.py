@@ -120,7 +120,7 @@ def camera_ports(
 
 def _box_ports(config: ModelConfig) -> Iterator[Port]:
     """The boxes that a file may have, decoded."""
-    count = min(config.decoder.max_boxes, config.decoder.queries * len(config.classes))
+    count = min(config.decoder.max_boxes, config.object_queries * len(config.classes))
     yield Port(
         "boxes",
         (1, count, 9),
@@ -129,6 +129,12 @@ def _box_ports(config: ModelConfig) -> Iterator[Port]:
     )
     yield Port("scores", (1, count), "(1, K): 0 to 1, falling.")
     yield Port("classes", (1, count), "(1, K): index into the metadata's classes.", torch.int64)
+
+
+def _image_sizes_port(lead: tuple[int, int]) -> Port:
+    """An input of a model on a detector. lead: 1 and N."""
+    meaning = "(1, N, 2): width and height of each image within its padding, pixels of the resized image."
+    return Port("image_sizes", (*lead, 2), meaning)
 
 
 def _image_box_ports(config: ModelConfig, cameras: int) -> Iterator[Port]:
@@ -182,7 +188,9 @@ class RecurrentForm(ExportForm):
 
     @property
     def inputs(self) -> tuple[Port, ...]:
-        return (*camera_ports(self.config, (1, self.cameras)), *_history_ports(self.config))
+        lead = (1, self.cameras)
+        sizes = (_image_sizes_port(lead),) if self.config.image_classes else ()
+        return (*camera_ports(self.config, lead), *_history_ports(self.config), *sizes)
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         return (*super().outputs(decode=decode), *_image_box_ports(self.config, self.cameras))
@@ -225,10 +233,15 @@ def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelCon
     """The inputs by name. history: (1, Y·X, C), the BEV map of the previous frame; None without one."""
     grid = config.bev_grid
     previous = torch.zeros(1, grid.rows * grid.columns, config.channels) if history is None else history
-    return camera_feed(inputs) | {
-        "can_bus": inputs.can_bus,
-        "shift": inputs.shift,
-        "rotation": inputs.rotation_deg,
-        "previous_bev": previous,
-        "use_previous": torch.tensor([history is not None]),
-    }
+    sizes = {"image_sizes": inputs.image_sizes} if config.image_classes else {}
+    return (
+        camera_feed(inputs)
+        | sizes
+        | {
+            "can_bus": inputs.can_bus,
+            "shift": inputs.shift,
+            "rotation": inputs.rotation_deg,
+            "previous_bev": previous,
+            "use_previous": torch.tensor([history is not None]),
+        }
+    )

@@ -78,9 +78,8 @@ class ExportedStep(nn.Module):
             most_cameras=count.max()[None].long(),
         )
 
-    def outputs(self, bev: Tensor, most_cameras: Tensor) -> tuple[Tensor, ...]:
-        """The outputs in the order of `ExportForm.outputs`. bev: (1, Y·X, C). most_cameras: (1,), see `SlottedHits`."""
-        outputs: ModelOutputs = self.network.detect(bev)
+    def outputs(self, outputs: ModelOutputs, most_cameras: Tensor) -> tuple[Tensor, ...]:
+        """The outputs in the order of `ExportForm.outputs`. most_cameras: (1,), see `SlottedHits`."""
         named = outputs.by_name
         boxes = decode_boxes(named["class_logits"], named["box_codes"], self.config) if self.decode else ()
         return (*with_most_cameras(tuple(named.values()), most_cameras), *boxes)
@@ -105,6 +104,7 @@ class RecurrentStep(ExportedStep):
         rotation: Tensor,
         previous_bev: Tensor,
         use_previous: Tensor,
+        image_sizes: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """One step; `RecurrentForm` documents every input and output."""
         network = self.network
@@ -126,8 +126,9 @@ class RecurrentStep(ExportedStep):
             assert isinstance(layer, EncoderLayer)
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        image_boxes = network.backbone.image_boxes(maps, has_image)
-        return (*self.outputs(bev, hits.most_cameras), *(image_boxes.by_name.values() if image_boxes else ()))
+        outputs = network.detect_with_images(bev, maps, has_image, image_from_bev, image_sizes)
+        boxes = outputs.image_boxes
+        return (*self.outputs(outputs, hits.most_cameras), *(boxes.by_name.values() if boxes else ()))
 
 
 def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
