@@ -1,7 +1,6 @@
 """The short commands of the core: `bevcli samples`, `viz` and `project-debug`."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,9 +117,7 @@ def project_debug(
     cameras.png (pillars, ground grid and horizon in each image), coverage.png (how many cameras see each BEV cell),
     recording.rrd (for bevcli viz) and findings.json. Existing files are overwritten.
 
-    With --model or --against, also measures what the rig costs: the same rendered streets are seen by it and by a rig
-    that the weights know. The table says what each difference costs, and rig_gap.png where less is found. It takes
-    about a minute, and seconds the next time. Weights that know no rendered streets are compared by a rule.
+    After the findings, the rig is compared with those that the weights of --model were trained on.
 
     Exit code: 0 without errors, 3 with findings of severity error.
     """
@@ -132,31 +129,19 @@ def project_debug(
     check = bevcli.check_calibration(
         input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
     )
-    model, gap = options.model or "demo", None
-    if not check.errors:
+    if options.motion and not check.errors:
+        from bevcli.workshop.calibration.core_options import check_motion
+
         if options.sequence is not None:
             drive_options["calibration"] = input
         how = {"ground_truth": False, "allow_outside": source.allow_outside, **drive_options}
-        path = options.sequence or input
-        if options.motion:
-            from bevcli.workshop.calibration.core_options import check_motion
-
-            check = check.with_findings(check_motion(_drive_of(path, **how)))
-        if options.model is not None or options.against is not None:
-            from bevcli.workshop.trust.gap_option import gap_of_rigs
-
-            gap = gap_of_rigs(check, model, options.against, _drive_of(path, **{**how, "ego_motion": "optional"}))
-            check = replace(check, further={"rig_gap": gap.to_dict()})
+        check = check.with_findings(check_motion(_drive_of(options.sequence or input, **how)))
     folder = options.out or Path("runs") / f"{check.name}-project-debug"
-    written = check.write(folder) + (gap.write(folder) if gap else [])
+    written = check.write(folder)
     if as_json:
         say(check.to_json())
     else:
-        notes = model_notes(check.rig, model)
-        if gap is not None:
-            notes.append(f"{gap.text()}\n")
-        elif options.model is not None or options.against is not None:
-            notes.append("Rig gap: not measured, because of the errors above.\n")
+        notes = model_notes(check.rig, options.model or "demo")
         say(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

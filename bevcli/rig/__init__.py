@@ -26,15 +26,10 @@ class CheckOptions:
     model: str | None = option(
         reads="path or name",
         default=None,
-        help="Compare the rig with those that this model's weights were trained on, and measure what each difference "
-        "costs: a model name or a FILE.toml. Default: demo, without the measurement.",
+        help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml. "
+        "Default: demo.",
         metavar="NAME|FILE",
         complete=complete_model,
-    )
-    against: Path | None = option(
-        reads="path",
-        default=None,
-        help="A second calibration or drive: measure both rigs with the model, and what the second one gains or loses.",
     )
     motion: bool = option(
         default=True,

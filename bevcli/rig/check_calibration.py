@@ -7,7 +7,7 @@ import json
 import os
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -57,7 +57,6 @@ class CalibrationCheck:
         coverage: how many cameras see each cell of the BEV grid.
         measures: the rig next to nuScenes'; empty where errors make the comparison meaningless.
         images: by camera, (H, W, 3) uint8 BGR, of the chosen frame; empty without a sequence.
-        further: results of other parts, by their key in findings.json.
     """
 
     name: str
@@ -66,7 +65,6 @@ class CalibrationCheck:
     coverage: Coverage
     measures: tuple[Measure, ...]
     images: Mapping[str, NDArray[np.uint8]]
-    further: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def errors(self) -> tuple[Finding, ...]:
@@ -84,7 +82,7 @@ class CalibrationCheck:
     def to_json(self) -> str:
         """The findings and the coverage as one JSON object, the content of findings.json."""
         findings = [asdict(finding) for finding in self.findings]
-        content = {"findings": findings, "coverage": _coverage_to_json(self.coverage), **self.further}
+        content = {"findings": findings, "coverage": _coverage_to_json(self.coverage)}
         return json.dumps(content, indent=1, ensure_ascii=False)
 
     def write(self, folder: Path | str) -> list[Path]:

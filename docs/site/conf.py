@@ -33,7 +33,7 @@ SECTIONS = {
         "docs/recording",
         "docs/rendered-drives",
     ],
-    "Calibrate": ["docs/calibration", "docs/rig-gap"],
+    "Calibrate": ["docs/calibration"],
     "Score": ["docs/scoring", "docs/compare", "docs/robustness", "docs/trust"],
     "Train": ["docs/fine-tune", "docs/training", "docs/model-card"],
     "Deploy": ["docs/deploy", "docs/containers", "docs/speed", "docs/fleet"],

@@ -1,8 +1,7 @@
-"""`find_faults`: mistakes in the input, and broken weights or engines, that show without labels. One line each.
+"""`find_faults`: mistakes in the input, and broken engines, that show without labels. One line each.
 
 In this order: cameras that are dead or frozen, by their pixels; single cameras and poses, by how points move in the
-images; the order of colours, by the model's scores with the order reversed; an engine, by the boxes of PyTorch; weights
-that find little, by rendered streets.
+images; the order of colours, by the model's scores with the order reversed; an engine, by the boxes of PyTorch.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from bevcli.findings import Finding, errors_of
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
@@ -26,10 +24,8 @@ from bevcli.sequences.view import select
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.views import Viewer
-from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
 from bevcli.workshop.trust.figures import figures_of
-from bevcli.workshop.trust.rig_gap import Shot, boxes_of
 
 STEPS = 6  # between frames whose images are compared
 POSE_STEPS = 4  # between frames whose motion is measured
@@ -37,10 +33,8 @@ TRIED = 3  # frames that the model sees with another order of colours
 SMALL = (64, 36)  # pixels of the images whose grey levels are compared
 FLAT = 2.0  # grey levels: standard deviation of an image that shows something
 STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
-SURE, REPEATED_M, NEAR_M = 0.3, 2.0, 20.0  # boxes that are looked for: score, error, distance of a true one
+SURE, REPEATED_M = 0.3, 2.0  # boxes that are looked for: score, error
 LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
-LEAST_FOUND = 0.6  # share of near objects of rendered streets that sound weights find; demo finds 0.92
-LEAST_CONFIDENCE, LEAST_PERSISTENCE = 0.35, 0.2  # figures of weights that need no check
 BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
 
 
@@ -130,12 +124,11 @@ def image_findings(names: Iterable[str], frames: Sequence[dict[str, Array]]) -> 
 
 
 def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
-    """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
+    """Faults that show in the boxes of a few frames: colours in the wrong order, or a broken engine."""
     first = max(0, (len(drive.stamps) - TRIED) // 2)
     some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
     boxes = frame_boxes(model, some)
-    broken = engine_findings(model, some, boxes) or weights_findings(model, boxes, drive.rig)
-    return (*color_findings(model, some, boxes), *broken)
+    return (*color_findings(model, some, boxes), *engine_findings(model, some, boxes))
 
 
 def frame_boxes(
@@ -173,24 +166,6 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> 
     advice = "export the model again, or use another precision or engine"
     found, expected = f"{same:.0%} of {count} boxes", f"{LEAST_SAME:.0%} or more"
     return (Finding("engine-broken", "error", None, message, found, expected, advice),)
-
-
-def weights_findings(model: Model, boxes: Sequence[FrameBoxes], rig: CameraRig) -> tuple[Finding, ...]:
-    """The finding about weights that find little, here and on rendered streets of the rig that they know."""
-    figures = figures_of(boxes, rig, model.config.bev_grid.nearest_side_m)
-    is_low = figures.confidence < LEAST_CONFIDENCE or figures.persistence < LEAST_PERSISTENCE
-    if not (is_low and model.config.training_rigs.known):  # else it is not known what they were trained on
-        return ()
-    known = nuscenes_like_rig(*model.config.image.size)
-    pairs = boxes_of(model.in_engine(known), Shot(known, frames=1))
-    near = [true[np.linalg.norm(true.centers[:, :2], axis=1) < NEAR_M] for _, true in pairs]
-    count, same = agreement(near, [predicted for predicted, _ in pairs])
-    if same >= LEAST_FOUND:
-        return ()
-    message = "the model finds little in rendered streets too, so that the drive is not to blame"
-    found, expected = f"{same:.0%} of {count} near objects", f"{LEAST_FOUND:.0%} or more"
-    advice = "take weights and model file of one training, and check the engine"
-    return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
 
 
 def agreement(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, float]:
