@@ -29,7 +29,7 @@ def service():
     return SimpleNamespace(**found)
 
 
-def post(port: int, body: dict[str, str]) -> tuple[int, bytes]:
+def post(port: int, body: object) -> tuple[int, bytes]:
     connection = HTTPConnection("127.0.0.1", port, timeout=60)
     connection.request("POST", "/", json.dumps(body))
     answer = connection.getresponse()
@@ -48,6 +48,10 @@ def test_the_service_draws_what_it_is_sent(service):
     status, text = post(server.server_port, {"FRONT": b64encode(front).decode()})
     assert (status, text.decode().count("\n")) == (400, 0)
     assert "camera FRONT is not in the rig (it has CAM_FRONT, " in text.decode()
+    cut = b64encode(front[:600]).decode()
+    for body in ({"CAM_FRONT": ""}, {"CAM_FRONT": "not base64"}, {"CAM_FRONT": cut}, {"CAM_FRONT": 7}, [""]):
+        status, text = post(server.server_port, body)
+        assert (status, len(text.decode().splitlines())) == (400, 1), body
     server.shutdown()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -217,3 +218,42 @@ def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, kept: int, 
     boxes = [labelled.load(place).ground_truth for place in range(4)]
     assert all((each.sizes_lwh > 0).all() for each in boxes if each is not None)
     assert len(labelled.load(0).ground_truth or ()) == kept
+
+
+def in_other_units(length: float, width: float, yaw: float, unit: float = 1.0) -> str:
+    rows = [f"{frame},car,{10 * unit},0,{unit},{length * unit},{width * unit},{1.5 * unit},{yaw}" for frame in range(4)]
+    return "\n".join([HEAD, *rows, f"0,pedestrian,{5 * unit},0,{unit},{0.7 * unit},{0.6 * unit},{1.7 * unit},0"])
+
+
+@pytest.mark.parametrize(
+    ("text", "note"),
+    [
+        (in_other_units(4.5, 1.9, -179.0), "the yaws, of up to 179, are taken to be in degrees"),
+        (in_other_units(4.5, 1.9, 350.0), "the yaws, of up to 350, are taken to be in degrees"),
+        (in_other_units(1.9, 4.5, 1.0), "4 of 4 vehicles are wider than long: are length and width exchanged?"),
+    ],
+)
+def test_degrees_and_exchanged_sides_are_noted(text: str, note: str, tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text(text)
+    drive = WithLabels(MadeDrive(4), tmp_path / "labels.csv")
+    assert any(note in line for line in drive.notes)
+    yaw = float(text.split("\n")[1].split(",")[-1])
+    yaw = np.radians(yaw) if "degrees" in note else yaw
+    assert np.exp(1j * drive.load(0).ground_truth.yaws[0]) == pytest.approx(np.exp(1j * yaw))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            in_other_units(4.5, 1.9, 0.1, 1000),
+            "boxes of 4500 m, the median is 4500 m (in millimetres?): convert x, y, z",
+        ),
+        (in_other_units(4.5, 1.9, 0.1, 100), "boxes of 450 m, the median is 450 m (in centimetres?)"),
+        (in_other_units(4.5, 1.9, 4000.0), "a yaw of 4000 (expected radians, or degrees up to 360)"),
+    ],
+)
+def test_boxes_of_no_object_are_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(InputError, match=re.escape(message)):
+        WithLabels(MadeDrive(4), tmp_path / "labels.csv")

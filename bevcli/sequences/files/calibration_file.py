@@ -114,7 +114,7 @@ def _own_file(path: Path) -> Path | None:
     if path.suffix.lower() != ".json" or not path.exists():
         return path if path.name == CALIBRATION else None
     document = read_json(path, largest=LARGEST_JSON)
-    is_own = not isinstance(document, dict) or "format" in document
+    is_own = not isinstance(document, (dict, list)) or "format" in document  # a list: cameras of another program
     return path if is_own or (path.name == CALIBRATION and "cameras" in document) else None
 
 

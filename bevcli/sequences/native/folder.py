@@ -59,10 +59,13 @@ class FolderDrive(ListedDrive):
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         entries = read_frames_table(table, rig.names) if is_there(table) else ()
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
-        self.understood, advice = "", "add ego-motion, or remove the frame"
+        self.understood, left_out, advice = "", "", "add ego-motion, or remove the frame"
         if not entries:
+            from bevcli.workshop.formats.first_images import cameras_with_images
             from bevcli.workshop.formats.unlisted import covered, find_frames
 
+            used, left_out = cameras_with_images(rig.names, path)
+            rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             frames = find_frames(path, rig.names, own, motion, has_poses=has_poses)
             poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0])))
@@ -80,7 +83,12 @@ class FolderDrive(ListedDrive):
         sources = [source for entry in entries for source in entry.sources.values() if isinstance(source, ImageSource)]
         videos = sorted({source.path for source in sources if source.video_index is not None})
         assumed = ("the calibration",) if draft.notes else ()
-        notes = (*draft.notes, *bev_frame_notes(rig, *assumed), *filter(None, [self.understood]), *poses.notes)
+        notes = (
+            *draft.notes,
+            *bev_frame_notes(rig, *assumed),
+            *filter(None, [self.understood, left_out]),
+            *poses.notes,
+        )
         notes += tuple(rotation_notes(videos))
         super().__init__(path, common, rig, entries, poses.motion, notes=notes)
         self.facts = replace(facts, geo_origin=facts.geo_origin or poses.geo_origin)

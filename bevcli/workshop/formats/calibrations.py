@@ -31,7 +31,7 @@ from bevcli.workshop.formats.camera_poses import (
     guessed_pose,
     raised,
 )
-from bevcli.workshop.formats.first_images import first_images, size_of_first
+from bevcli.workshop.formats.first_images import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
 from bevcli.workshop.formats.other_calibrations import (
@@ -77,14 +77,20 @@ def read_rig(
         cameras = {name: replace(of, pose=poses[name].pose if name in poses else None) for name, of in cameras.items()}
     cameras = _named_as_images(_along_chain(cameras), drive)
     where = calibration if extrinsics is None else extrinsics
-    ego_from_camera, how = _poses(where, cameras, transform, height, yaw_deg)
+    used, left_out = cameras_with_images(cameras, drive)
+    # The poses of cameras without images tell how those of the others are meant.
+    posed = {name: of for name, of in cameras.items() if name in used or of.pose is not None}
+    ego_from_camera, how = _poses(where, posed, transform, height, yaw_deg)
     rig = tuple(
         require(
             parse_camera, name, _fields(name, of, ego_from_camera[name], calibration, drive), where=where, camera=name
         )
         for name, of in cameras.items()
+        if name in used
     )
-    text = f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}; {how}"
+    text = "; ".join(
+        filter(None, (f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}", how, left_out))
+    )
     ego_from_bev = _bev_frame(where)
     camera_rig = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
     return RigDraft(camera_rig, (Finding("calibration-read", "info", None, text),))
@@ -142,7 +148,8 @@ def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, dri
     size = of.size or size_of_first(drive, name)
     if size is None:
         raise InputError(
-            f"{path}: camera {name}: the image size is missing, and no image of it was found: add width and height"
+            f"{path}: camera {name}: the image size is missing, and no image of it was found: add width and height, or "
+            f"name the folder of its images {name}"
         )
     sides = {key: int(value) if isinstance(value, float) and value.is_integer() else value
              for key, value in zip(("width", "height"), size, strict=True)}  # fmt: skip
@@ -183,7 +190,7 @@ def _read_cameras(path: Path) -> tuple[str, Cameras]:
 
 def _extrinsics(path: Path) -> Cameras:
     """The cameras of a file with poses."""
-    if path.suffix.lower() == ".json" and not isinstance(read_document(path), dict):
+    if path.suffix.lower() == ".json" and not isinstance(read_document(path), (dict, list)):
         raise InputError(
             f'{path}: "cameras" is missing (expected {{"cameras": {{"cam0": {{"ego_from_camera": ...}}}}}})'
         )

@@ -12,6 +12,7 @@ SHORT = {
     "rr": "back right",
 }  # fmt: skip
 WORD = re.compile(r"camera|cam|image|img|front|forward|back|rear|left|right|[a-z]+|\d+")
+NUMBERED = re.compile(r"(image|img)_?\d+")  # such as image_2 of KITTI
 ANY = {"camera", "cam", "image", "img"}  # words that tell no camera from another
 DIRECTIONS = {"front", "back", "left", "right"}
 LOOKED_AT = 50  # entries of a folder
@@ -52,7 +53,7 @@ def has_camera_folders(path: Path) -> bool:
 
 
 def _is_camera_folder(path: Path) -> bool:
-    named = "cam" in path.name.lower() or bool(words_of(path.name) & DIRECTIONS)
+    named = "cam" in path.name.lower() or words_of(path.name) & DIRECTIONS or NUMBERED.fullmatch(path.name.lower())
     if not named or not path.is_dir():
         return False
     return any(file.suffix.lower() in IMAGE_SUFFIXES for file, _ in zip(path.iterdir(), range(LOOKED_AT), strict=False))

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -33,6 +34,19 @@ def first_images(drive: Path) -> dict[str, Path]:
         if videos or images:
             return videos | images
     return {}
+
+
+def cameras_with_images(cameras: Iterable[str], drive: Path | None) -> tuple[list[str], str]:
+    """The cameras that have images in a drive, and a note on the others; "" where none is left out.
+
+    All of them where the drive has other images too: a name may be misspelt.
+    """
+    cameras, found = list(cameras), {} if drive is None else first_images(drive)
+    used = match_names(cameras, found)
+    others = [name for name in cameras if name not in used]
+    if not others or not used or len(used) < len(found):
+        return cameras, ""
+    return list(used), f"without images, left out: {', '.join(others)}"
 
 
 def _listed(table: Path) -> dict[str, Path]:

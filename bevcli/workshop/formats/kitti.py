@@ -17,6 +17,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.workshop.formats import ExportOptions, LabelOptions
 from bevcli.workshop.formats.label_format import LabelledFrame, Labels
+from bevcli.workshop.formats.plausible_labels import LARGEST_RADIANS
 from bevcli.writing import write_whole
 
 LARGEST_BYTES = 256 * MIB
@@ -89,6 +90,8 @@ def _box(where: str, words: list[str], track: str, camera: Camera) -> Boxes3D:
         ) from None
     if len(words) not in WORDS or not np.isfinite([height, width, length, x, y, z, rotation_y]).all():
         raise InputError(f"{where}: expected {WORDS[0]} or {WORDS[1]} words, and finite numbers")
+    if abs(rotation_y) > LARGEST_RADIANS and min(height, width, length) > 0:
+        raise InputError(f"{where}: rotation_y is {rotation_y:g} (expected radians, as KITTI has them): convert it")
     rotation = camera.ego_from_camera[:3, :3]
     heading = rotation @ [np.cos(rotation_y), 0, -np.sin(rotation_y)]
     center = rotation @ [x, y, z] + camera.ego_from_camera[:3, 3] + [0, 0, height / 2]

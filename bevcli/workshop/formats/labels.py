@@ -28,6 +28,7 @@ from bevcli.sequences.view import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
 from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment
+from bevcli.workshop.formats.plausible_labels import check_labels
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
@@ -44,7 +45,7 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
-    return replace(labels, frames=frames, notes=(*labels.notes, *note))
+    return check_labels(path, replace(labels, frames=frames, notes=(*labels.notes, *note)))
 
 
 def with_labels(drive: Drive, options: LabelOptions) -> Drive:

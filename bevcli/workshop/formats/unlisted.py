@@ -160,7 +160,8 @@ def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None, has_pose
         if camera not in matched:
             others = ", ".join(name for name in found if name not in matched.values()) or "no other folder"
             raise InputError(
-                f"{folder / camera}: the folder is missing (the calibration has the camera {camera}; found {others})"
+                f"{folder / camera}: the folder is missing (the calibration has the camera {camera}; found {others}): "
+                "name the folder like the camera"
             )
     paths = {camera: _image_files(folder / name) for camera, name in matched.items()}
     names = {camera: [path.stem for path in of_camera] for camera, of_camera in paths.items()}
@@ -189,7 +190,7 @@ def _image_files(folder: Path) -> list[Path]:
 def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timing) -> Found:
     """Frames of images whose names are times: of all cameras those that are nearest to each other."""
     start, first = timing.start_ns, min(int(times.min()) for times in reading.values.values())
-    moved = 0 if start is None or reading.is_known_origin else start - first
+    moved = 0 if start is None else start - first
     cameras = {}
     periods = measured_periods(reading.values)
     for camera, of_camera in paths.items():
@@ -199,7 +200,8 @@ def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timin
         cameras[camera] = CameraImages(f"the folder {of_camera[0].parent.name}", times[order], periods[camera],
                                        sources.__getitem__)  # fmt: skip
     matched = match(cameras)
-    return matched.entries, f"times are {reading.words}, {_matched(cameras, matched)}"
+    of_start = f", moved so that the first is {start} ns" if moved and reading.is_known_origin else ""
+    return matched.entries, f"times are {reading.words}{of_start}, {_matched(cameras, matched)}"
 
 
 def _matched(cameras: Mapping[str, CameraImages], matched: Matched) -> str:
