@@ -32,6 +32,7 @@ from bevcli.workshop.formats.camera_poses import (
     raised,
 )
 from bevcli.workshop.formats.first_images import cameras_with_images, first_images, size_of_first
+from bevcli.workshop.formats.information_files import is_information, read_information
 from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
 from bevcli.workshop.formats.other_calibrations import (
@@ -42,6 +43,7 @@ from bevcli.workshop.formats.other_calibrations import (
     read_kitti,
     read_nerfstudio,
 )
+from bevcli.workshop.formats.vins_fusion import main_files, read_vins_fusion
 
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera
@@ -291,6 +293,8 @@ def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str
 
 # What a file is -> whether a path is it, and its reader. The first that fits is taken.
 KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cameras]]] = {
+    "information file of BEVDet or mmdetection3d": (is_information, read_information),
+    "VINS-Fusion": (lambda path: bool(main_files(path)), read_vins_fusion),
     "COLMAP": (is_colmap, read_colmap),
     "nerfstudio": (is_nerfstudio, read_nerfstudio),
     "KITTI": (

@@ -20,10 +20,12 @@ from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
+from bevcli.workshop.formats.autoware import urdf_document, with_own_names
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
+from bevcli.workshop.formats.waymo import with_intrinsics_by_name
 
-SUFFIXES = (".yaml", ".yml", ".json", ".xml")
+SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
 INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
               "camintrinsic", "projectionparameters")  # fmt: skip
@@ -51,7 +53,7 @@ NO_TRANSFORM = "is not understood as a transform (expected 4x4 or 3x4 numbers, o
 def read_named(path: Path) -> Cameras:
     """The cameras of a file with K, D and T, or of a folder of such files, in which poses may be files of their own."""
     if not path.is_dir():
-        return _named_cameras(read_document(path), path)
+        return cameras_of(read_document(path), path)
     cameras: Cameras = {}
     for file in files_in(path):
         for name, of in read_named(file).items():
@@ -76,6 +78,8 @@ def read_document(path: Path) -> Any:
         return read_json(path, largest=LARGEST_BYTES)
     if path.suffix.lower() == ".xml":
         return _from_xml(parse_xml(read_bytes(path, YAML_BYTES), path))
+    if path.suffix.lower() == ".urdf":
+        return urdf_document(parse_xml(read_bytes(path, YAML_BYTES), path))
     return read_yaml(path)
 
 
@@ -99,14 +103,16 @@ def number_of(word: str) -> float | None:
         return None
 
 
-def _named_cameras(document: Any, path: Path) -> Cameras:
+def cameras_of(document: Any, path: Path) -> Cameras:
+    """The cameras of a document with their K, D and T by name. Raises InputError, which names `path`."""
+    document = with_own_names(document, path)
     expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
     if isinstance(document, list):
         document = {"cameras": document}
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
     document = {re.sub(r"\ACamera\d*\.", "", str(key)): value for key, value in document.items()}  # ORB-SLAM's names
-    entries = document.get("cameras", document.get("sensors"))
+    entries = _value(document, "cameras", "sensors", "cameracalibrations")
     if isinstance(entries, list):
         names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")
                  if isinstance(entry, dict) else "" for index, entry in enumerate(entries)]  # fmt: skip
@@ -145,6 +151,7 @@ def _value(entry: Mapping[Any, Any], *names: str) -> Any:
 
 def _named_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
     """What a mapping states of a camera."""
+    entry = with_intrinsics_by_name(entry)
     model = _lens_name(_value(entry, "cameramodel", "modeltype") or "pinhole")
     if model not in (*PINHOLES, *LENS_NAMES):
         raise InputError(f"{where}: camera_model {model:.60} is not supported (expected pinhole)")
@@ -250,7 +257,7 @@ def _pose(entry: Mapping[str, Any], where: str) -> StatedPose | None:
 def _direction_of(key: str) -> Direction | None:
     """The direction that a name states, such as T_cam_ego, cam2ego, camera_to_vehicle; None for another name."""
     words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower()
-    words = re.sub("base_link|vehicle_frame", "base", words).replace("2", "_to_")
+    words = re.sub(r"(?<=[a-z])2(?=[a-z])", "_to_", re.sub("base_link|vehicle_frame", "base", words))
     match = re.fullmatch(
         rf"(?:t_|tf_)?({CAMERA_FRAMES}|{EGO_FRAMES})_(?:(from|to|t)_)?({CAMERA_FRAMES}|{EGO_FRAMES})", words
     )

@@ -22,6 +22,8 @@ from bevcli.workshop.formats.named_calibration import COEFFICIENTS, lens_fields,
 
 KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt")
 LARGEST_TEXT = 64 * MIB
+NO_CAMERA = ("", ".", "images")  # folders that are not named after a camera
+SAME_FOCAL = 1.05  # ratio of focal lengths that a program finds for images of one camera
 PIXEL_CENTER = 0.5  # COLMAP and nerfstudio: coordinates of the centre of the top left pixel; 0 here
 # COLMAP's models: the number of focal lengths, the model of the lens, and the coefficients in the file's order.
 COLMAP_MODELS = {
@@ -70,22 +72,36 @@ def read_colmap(path: Path) -> Cameras:
         if len(words) < 4 or None in numbers:
             raise InputError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
         by_id[words[0]] = replace(_colmap_camera(words[1], numbers[2:], where), size=(numbers[0], numbers[1]))
-    poses: dict[tuple[str, str], list[Array]] = {}
+    poses, ids = dict[str, list[Array]](), dict[str, dict[str, None]]()
     images = folder / "images.txt"
     lines = list(_lines_of(images, keep_empty=True)) if images.exists() else []
-    for number, line in lines[::2]:  # the other lines are points
+    entries = [line.split(maxsplit=9) for _, line in lines[::2]]  # the other lines are points
+    camera_of = {words[9]: words[8] for words in entries if len(words) == 10}
+    names = _names_of_images(
+        {path: f"camera{key}" for path, key in camera_of.items()},
+        each_its_own=len(set(camera_of.values())) == len(camera_of) > 1,
+    )
+    for number, line in lines[::2]:
         words = line.split(maxsplit=9)
         numbers = [number_of(word) for word in words[:8]]
         if len(words) < 10 or None in numbers or words[8] not in by_id:
             raise InputError(f"{images}: line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         _, *pose_numbers = np.array(numbers, dtype=np.float64)
         pose = rigid(pose_numbers[4:], rotation_from_quaternion(pose_numbers[:4]))
-        poses.setdefault((words[8], _folder_of(words[9], f"camera{words[8]}")), []).append(pose)
+        name = names[words[9]]
+        poses.setdefault(name, []).append(pose)
+        ids.setdefault(name, {})[words[8]] = None
     if not poses:
         return {f"camera{key}": camera for key, camera in by_id.items()}
     return {
-        name: _posed(by_id[key], poses_of_camera, images.name, "camera_from_ego", "optical")
-        for (key, name), poses_of_camera in poses.items()
+        name: _posed(
+            _one_camera([by_id[key] for key in ids[name]], f"{folder / 'cameras.txt'}: camera {name}"),
+            of_camera,
+            images.name,
+            "camera_from_ego",
+            "optical",
+        )
+        for name, of_camera in poses.items()
     }
 
 
@@ -118,10 +134,31 @@ def _lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, st
             yield number, line
 
 
-def _folder_of(name: str, default: str) -> str:
-    """The camera of an image's path: its folder."""
-    parent = Path(name).parent.name
-    return default if parent in ("", "images", ".") else parent
+def _names_of_images(images: Mapping[str, str], *, each_its_own: bool) -> dict[str, str]:
+    """The camera of each image, by its path: its folder; without one, its name without a number.
+
+    images: path -> the camera where neither names one. each_its_own: each image has intrinsics of its own.
+    """
+    stems = {path: re.sub(r"[_. -]*\d+$", "", Path(path).stem) for path in images
+             if Path(path).parent.name in NO_CAMERA}  # fmt: skip
+    are_cameras = each_its_own and all(stems.values()) and len(set(stems.values())) == len(stems)
+    other = stems if are_cameras else images
+    return {path: other[path] if path in stems else Path(path).parent.name for path in images}
+
+
+def _one_camera(cameras: list[StatedCamera], where: str) -> StatedCamera:
+    """The camera whose images have intrinsics of their own: the median ones, where they are about equal."""
+    matrices = np.array([camera.intrinsics for camera in cameras])
+    focal = matrices[:, 0, 0]
+    if (
+        focal.max() > SAME_FOCAL * focal.min()
+        or len({str((each.distortion or {}).get("model")) for each in cameras}) > 1
+    ):
+        raise InputError(
+            f"{where}: its images have focal lengths of {focal.min():.0f} to {focal.max():.0f} px: state one camera "
+            "for each folder (COLMAP: --ImageReader.single_camera_per_folder 1), or put the images of each in a folder"
+        )
+    return replace(cameras[0], intrinsics=np.median(matrices, axis=0).tolist())
 
 
 def is_nerfstudio(path: Path) -> bool:
@@ -142,13 +179,18 @@ def read_nerfstudio(path: Path) -> Cameras:
         raise InputError(
             f'{file}: "frames" is missing (expected a list of objects with file_path and transform_matrix)'
         )
-    entries: dict[str, dict[str, Any]] = {}
+    paths = [str(frame.get("file_path", "")) for frame in frames]
+    names = _names_of_images(dict.fromkeys(paths, "camera"), each_its_own=all("fl_x" in frame for frame in frames))
+    entries: dict[str, list[dict[str, Any]]] = {}
     poses: dict[str, list[Array]] = {}
     for index, frame in enumerate(frames):
-        name, where = _folder_of(str(frame.get("file_path", "")), "camera"), f"{file}: frame {index}"
-        entries.setdefault(name, {**document, **frame})
+        name, where = names[paths[index]], f"{file}: frame {index}"
+        entries.setdefault(name, []).append({**document, **frame})
         poses.setdefault(name, []).append(require(parse_numbers, frame, "transform_matrix", (4, 4), where=where))
-    made = {name: _nerf_camera(entry, f"{file}: camera {name}") for name, entry in entries.items()}
+    made = {}
+    for name, of_camera in entries.items():
+        where = f"{file}: camera {name}"
+        made[name] = _one_camera([_nerf_camera(entry, where) for entry in of_camera], where)
     return {
         name: _posed(camera, poses[name], "transform_matrix", "ego_from_camera", "opengl")
         for name, camera in made.items()

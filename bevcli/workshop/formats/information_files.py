@@ -1,0 +1,157 @@
+"""Information files of BEVDet, BEVFormer and mmdetection3d: `nuscenes_infos_val.pkl`, or the same as JSON.
+
+An entry has the cameras of a sample: `cams` with `sensor2ego_rotation` and `cam_intrinsic`, or, from mmdetection3d 1.1
+on, `images` with `cam2ego` and `cam2img`. Where only the lidar is named (`sensor2lidar_rotation`, `lidar2cam`,
+`lidar2img`), its pose on the vehicle (`lidar2ego`) is needed, or the rig is that of the lidar.
+"""
+
+import io
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.linalg import rq
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
+from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import MIB, open_regular, read_bytes
+from bevcli.printing import reason_of
+from bevcli.sequences.files.json_fields import array_of_numbers
+from bevcli.workshop.formats.camera_poses import Cameras
+from bevcli.workshop.formats.named_calibration import cameras_of
+
+LARGEST_BYTES = 1024 * MIB
+PICKLES = (".pkl", ".pickle")
+LISTS = ("infos", "data_list")
+HEAD_BYTES = 4096  # of a JSON file, in which the name of a list stands
+SAME_M = 1e-3
+# What pickles of plain values and of NumPy's arrays call; nothing else is called.
+HARMLESS = {("_codecs", "encode"), ("collections", "OrderedDict"), ("numpy", "dtype"), ("numpy", "ndarray")} | {
+    (f"numpy.{core}.{module}", name)
+    for core in ("core", "_core")
+    for module, name in (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
+}
+
+
+class _Unpickler(pickle.Unpickler):
+    """An unpickler of plain values and arrays, which calls nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in HARMLESS:
+            raise pickle.UnpicklingError(f"it calls {module}.{name}, and was not read further")
+        return super().find_class(module, name)
+
+
+def is_information(path: Path) -> bool:
+    """True for a pickle, and for a JSON file with a list of entries."""
+    if path.suffix.lower() in PICKLES:
+        return True
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    with open_regular(path) as file:
+        head = file.read(HEAD_BYTES)
+    return any(f'"{name}"'.encode() in head for name in (*LISTS, "cam_intrinsic"))
+
+
+def read_information(path: Path) -> Cameras:
+    """The cameras of an information file, whose entries must have one rig. Raises InputError."""
+    document = _document(path)
+    entries = (
+        next((document[name] for name in LISTS if name in document), document)
+        if isinstance(document, dict)
+        else document
+    )
+    entries = entries if isinstance(entries, list) else [entries]
+    rigs = [_cameras(entry, f"{path}: entry {index}") for index, entry in enumerate(entries)]
+    if not rigs:
+        raise InputError(f"{path}: has no entries")
+    for index, rig in enumerate(rigs):
+        if rig.keys() != rigs[0].keys() or any(_differ(rig[name], rigs[0][name]) for name in rig):
+            raise InputError(f"{path}: entry {index} has another rig than entry 0: keep those of this drive")
+    return cameras_of(rigs[0], path)
+
+
+def _document(path: Path) -> Any:
+    if path.suffix.lower() not in PICKLES:
+        return read_json(path, largest=LARGEST_BYTES)
+    try:
+        return _Unpickler(io.BytesIO(read_bytes(path, LARGEST_BYTES))).load()
+    except Exception as error:  # a damaged pickle fails in many ways
+        raise InputError(f"{path}: cannot be read as a pickle ({reason_of(error)[:200]})") from None
+
+
+def _differ(camera: dict[str, Any], other: dict[str, Any]) -> bool:
+    return camera.keys() != other.keys() or any(
+        not np.allclose(camera[key], other[key], rtol=1e-4, atol=SAME_M) for key in camera
+    )
+
+
+def _cameras(entry: Any, where: str) -> dict[str, dict[str, Any]]:
+    cameras = entry.get("cams", entry.get("images")) if isinstance(entry, dict) else None
+    if not isinstance(cameras, dict) or not cameras or not all(isinstance(each, dict) for each in cameras.values()):
+        raise InputError(f'{where}: has no cameras (expected "cams" or "images" with one object for each camera)')
+    points = entry.get("lidar_points")
+    lidar = {**entry, **points} if isinstance(points, dict) else entry
+    ego_from_lidar = _transform(lidar, "lidar2ego", where)
+    return {str(name): _camera(camera, ego_from_lidar, f"{where}: camera {name}") for name, camera in cameras.items()}
+
+
+def _camera(camera: dict[str, Any], ego_from_lidar: Array | None, where: str) -> dict[str, Any]:
+    """The names and values of a camera that `cameras_of` reads."""
+    image_from_lidar = _matrix(camera, "lidar2img", where)
+    intrinsics = next(
+        (matrix for name in ("cam_intrinsic", "cam2img") if (matrix := _matrix(camera, name, where)) is not None), None
+    )
+    lidar_from_camera = _transform(camera, "sensor2lidar", where)
+    if (camera_from_lidar := _matrix(camera, "lidar2cam", where)) is not None:
+        lidar_from_camera = inverse(camera_from_lidar)
+    if image_from_lidar is not None and (intrinsics is None or lidar_from_camera is None):
+        intrinsics, lidar_from_camera = _split(image_from_lidar)
+    ego_from_camera = _transform(camera, "sensor2ego", where)
+    ego_from_camera = _matrix(camera, "cam2ego", where) if ego_from_camera is None else ego_from_camera
+    if intrinsics is None:
+        raise InputError(f"{where}: has no intrinsics (expected cam_intrinsic, cam2img or lidar2img)")
+    made: dict[str, Any] = {"K": intrinsics[:3, :3].tolist()}
+    made |= {key: camera[key] for key in ("width", "height") if key in camera}
+    if ego_from_camera is None and lidar_from_camera is not None and ego_from_lidar is not None:
+        ego_from_camera = ego_from_lidar @ lidar_from_camera
+    if ego_from_camera is not None:
+        return made | {"ego_from_camera": ego_from_camera.tolist()}
+    return made if lidar_from_camera is None else made | {"lidar2cam": inverse(lidar_from_camera).tolist()}
+
+
+def _transform(owner: dict[str, Any], name: str, where: str) -> Array | None:
+    """(4, 4) of NAME, or of NAME_rotation and NAME_translation; None where there is neither."""
+    if owner.get(name) is not None:
+        return _matrix(owner, name, where)
+    rotation, translation = (array_of_numbers(owner.get(f"{name}_{part}")) for part in ("rotation", "translation"))
+    if rotation is None or translation is None:
+        return None
+    if rotation.size not in (4, 9) or translation.size != 3:
+        raise InputError(f"{where}: {name}_rotation: expected w, x, y, z or 3x3 numbers, and three of a translation")
+    turned = rotation_from_quaternion(rotation.ravel()) if rotation.size == 4 else rotation.reshape(3, 3)
+    return rigid(translation.ravel(), turned)
+
+
+def _matrix(owner: dict[str, Any], name: str, where: str) -> Array | None:
+    """(4, 4) of 3x3, 3x4 or 4x4 numbers; None where there are none."""
+    if owner.get(name) is None:
+        return None
+    numbers = array_of_numbers(owner[name])
+    if numbers is None or numbers.shape not in ((3, 3), (3, 4), (4, 4)) or not np.isfinite(numbers).all():
+        raise InputError(f"{where}: {name}: expected 3x3 or 4x4 finite numbers")
+    matrix = np.eye(4)
+    matrix[: numbers.shape[0], : numbers.shape[1]] = numbers
+    return matrix
+
+
+def _split(image_from_lidar: Array) -> tuple[Array, Array]:
+    """(4, 4) intrinsics and lidar_from_camera of a projection."""
+    triangle, rotation = rq(image_from_lidar[:3, :3])
+    signs = np.diag(np.sign(np.diag(triangle)))
+    triangle, rotation = triangle @ signs, signs @ rotation
+    intrinsics, camera_from_lidar = np.eye(4), rigid(np.linalg.solve(triangle, image_from_lidar[:3, 3]), rotation)
+    intrinsics[:3, :3] = triangle / triangle[2, 2]
+    return intrinsics, inverse(camera_from_lidar)

@@ -1,0 +1,240 @@
+"""Calibrations as other programs write them: made here, read, and compared with the rig of samples/street."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from test_calibrations import (
+    FACTS,
+    NAMES,
+    OPENGL,
+    SIZE,
+    VEHICLE,
+    D,
+    assert_is_the_street,
+    four,
+    k_of,
+    pose,
+    read,
+    written,
+)
+
+from bevcli.errors import InputError
+
+EGO_FROM_LIDAR = np.array([[0.0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 0, 0, 1]])  # x right, y forward
+
+
+def wxyz(matrix):
+    return np.roll(Rotation.from_matrix(matrix[:3, :3]).as_quat(), 1).tolist()
+
+
+def bevdet(name):
+    lidar = np.linalg.inv(EGO_FROM_LIDAR) @ pose(name)
+    return {
+        "data_path": f"samples/{name}/0.jpg", "type": name, "timestamp": 1533151603512404, "cam_intrinsic": k_of(name),
+        "sensor2ego_translation": pose(name)[:3, 3].tolist(), "sensor2ego_rotation": wxyz(pose(name)),
+        "sensor2lidar_rotation": lidar[:3, :3], "sensor2lidar_translation": lidar[:3, 3],
+    }  # fmt: skip
+
+
+def without(camera, *words):
+    return {key: value for key, value in camera.items() if not any(word in key for word in words)}
+
+
+def lidar2img(name):
+    projection = np.eye(4)
+    projection[:3, :3] = k_of(name)
+    return projection @ np.linalg.inv(pose(name)) @ EGO_FROM_LIDAR
+
+
+LIDAR2EGO = {
+    "lidar2ego_translation": EGO_FROM_LIDAR[:3, 3].tolist(), "lidar2ego_rotation": wxyz(EGO_FROM_LIDAR),
+}  # fmt: skip
+INFORMATION = {
+    "sensor2ego": [{"token": "a", "cams": {name: bevdet(name) for name in NAMES}, **LIDAR2EGO}] * 2,
+    "sensor2lidar": [{"cams": {name: without(bevdet(name), "sensor2ego") for name in NAMES}, **LIDAR2EGO}],
+    "cam2ego": [{"images": {name: {"cam2img": k_of(name), "cam2ego": pose(name)} for name in NAMES}}],
+    "lidar2img": [
+        {
+            "images": {name: {"lidar2img": lidar2img(name), "width": SIZE[0], "height": SIZE[1]} for name in NAMES},
+            "lidar_points": {"lidar2ego": EGO_FROM_LIDAR},
+        }
+    ],
+}
+
+
+@pytest.mark.parametrize("names", INFORMATION)
+@pytest.mark.parametrize("suffix", [".pkl", ".json"])
+def test_information_files_of_bevdet_and_mmdetection3d(tmp_path, names, suffix):
+    key = "data_list" if "2img" in names or names == "cam2ego" else "infos"
+    document = {key: INFORMATION[names], "metadata": {"version": "v1.0-mini"}}
+    path = tmp_path / f"nuscenes_infos_val{suffix}"
+    if suffix == ".pkl":
+        path.write_bytes(pickle.dumps(document))
+    else:
+        path.write_text(json.dumps(document, default=lambda array: array.tolist()))
+    found = read(path)
+    assert_is_the_street(found.rig)
+    assert "poses as stated" in found.notes[0]
+
+
+class Attack:
+    def __reduce__(self):
+        return print, ("called",)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        (Attack(), r"it calls builtins.print, and was not read further"),
+        ([], "has no entries"),
+        ([{"token": 1}], 'entry 0: has no cameras \\(expected "cams" or "images"'),
+        ([{"cams": {"A": {"sensor2ego_translation": [0, 0, 0]}}}], "entry 0: camera A: has no intrinsics"),
+        ([{"cams": {"A": {"cam_intrinsic": [1, 2]}}}], "camera A: cam_intrinsic: expected 3x3 or 4x4"),
+        ([{"cams": {"A": {**bevdet(NAMES[0]), "cam_intrinsic": k_of(name)}}} for name in NAMES[2:4]],
+         "entry 1 has another rig than entry 0: keep those of this drive"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_an_information_file_is_one_line(tmp_path, entries, message, capsys):
+    path = tmp_path / "infos.pkl"
+    path.write_bytes(pickle.dumps({"infos": entries}))
+    with pytest.raises(InputError, match=message):
+        read(path)
+    path.write_bytes(pickle.dumps({"infos": entries})[:20])
+    with pytest.raises(InputError, match="cannot be read as a pickle"):
+        read(path)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("layout", ["list", "context"])
+def test_nine_intrinsics_of_waymo(tmp_path, layout):
+    cameras = [
+        {
+            "name": name, "intrinsic": [*four(name), *D], "width": SIZE[0], "height": SIZE[1],
+            "extrinsic": {"transform": pose(name, axes=VEHICLE).ravel().tolist()},
+        }
+        for name in NAMES
+    ]  # fmt: skip
+    path = written(tmp_path, cameras if layout == "list" else {"cameraCalibrations": cameras}, "context.json")
+    found = read(path, None)
+    assert_is_the_street(found.rig, lens=True)
+    assert found.rig[NAMES[0]].distortion.coefficients == tuple(D)
+
+
+def pinhole(name, model="PINHOLE"):
+    numbers = dict(zip(("fx", "fy", "cx", "cy"), four(name), strict=True))
+    lens = {"distortion_parameters": dict(zip(("k1", "k2", "p1", "p2"), D[:4], strict=True))}
+    if model == "KANNALA_BRANDT":
+        numbers = dict(zip(("mu", "mv", "u0", "v0"), four(name), strict=True))
+        numbers, lens = {"k2": D[0], "k3": D[1], "k4": D[2], "k5": D[3], **numbers}, {}
+    facts = {"model_type": model, "camera_name": "camera", "image_width": SIZE[0], "image_height": SIZE[1]}
+    return "%YAML:1.0\n---\n" + yaml.safe_dump({**facts, **lens, "projection_parameters": numbers})
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "KANNALA_BRANDT"])
+@pytest.mark.parametrize("part", ["folder", "file"])
+def test_the_folder_of_vins_fusion(tmp_path, model, part):
+    lines = ["%YAML:1.0", "", "#common parameters", "imu: 1", "num_of_cam: 6", 'output_path: "~/output/"']
+    for index, name in enumerate(sorted(NAMES)):
+        written(tmp_path, pinhole(name, model), f"config/cam{index}.yaml")
+        data = ", ".join(map(str, pose(name).ravel()))
+        lines += [f'cam{index}_calib: "cam{index}.yaml"', f"body_T_cam{index}: !!opencv-matrix",
+                  "   rows: 4", "   cols: 4", "   dt: d", f"   data: [{data}]", ""]  # fmt: skip
+    main = written(tmp_path, "\n".join(lines), "config/stereo_config.yaml")
+    found = read(main.parent if part == "folder" else main, None)
+    assert_is_the_street(found.rig, [f"cam{index}" for index in range(len(NAMES))], lens=True)
+    assert found.rig["cam0"].distortion.model == ("brown_conrady" if model == "PINHOLE" else "kannala_brandt")
+    (main.parent / "cam3.yaml").unlink()
+    with pytest.raises(InputError, match=r"cam3\.yaml: the file is missing"):
+        read(main)
+
+
+def frame(matrix):
+    yaw, pitch, roll = Rotation.from_matrix(matrix[:3, :3]).as_euler("ZYX")
+    return dict(
+        zip(("x", "y", "z", "roll", "pitch", "yaw"), map(float, [*matrix[:3, 3], roll, pitch, yaw]), strict=True)
+    )
+
+
+BASE_FROM_KIT = np.eye(4)
+BASE_FROM_KIT[:3, :3] = Rotation.from_euler("ZYX", [0.4, 0.05, -0.02]).as_matrix()
+BASE_FROM_KIT[:3, 3] = 0.9, 0.1, 2.0
+
+
+@pytest.mark.parametrize("frames", ["camera_link", "camera_optical_link", "both"])
+def test_frames_of_autoware(tmp_path, frames):
+    """The cameras are placed on a kit of sensors, and the kit on the vehicle; K is in a file for each camera."""
+    from_kit, names = np.linalg.inv(BASE_FROM_KIT), ("camera_link", "camera_optical_link")
+    kit = {"velodyne_top_base_link": frame(np.eye(4))}
+    for name in NAMES:
+        bodies = {"camera_link": pose(name, axes=VEHICLE), "camera_optical_link": pose(name)}
+        kit |= {f"{name}/{each}": frame(from_kit @ bodies[each]) for each in names if frames in (each, "both")}
+        info = {
+            "camera_name": name,
+            "image_width": SIZE[0],
+            "image_height": SIZE[1],
+            "camera_matrix": k_of(name).tolist(),
+        }
+        written(tmp_path, info, f"intrinsics/{name}.yaml")
+    path = written(tmp_path, {"sensor_kit_base_link": kit}, "sensor_kit_calibration.yaml")
+    written(tmp_path, {"base_link": {"sensor_kit_base_link": frame(BASE_FROM_KIT)}}, "sensors_calibration.yaml")
+    assert_is_the_street(read(tmp_path / "intrinsics", None, extrinsics=path).rig)
+
+
+def test_joints_of_a_urdf(tmp_path):
+    """A joint to the body of each camera, and one from there to its optical frame."""
+    joints = []
+    for name in NAMES:
+        place = frame(pose(name, axes=VEHICLE))
+        xyz, rpy = (" ".join(str(place[key]) for key in keys) for keys in (("x", "y", "z"), ("roll", "pitch", "yaw")))
+        joints.append(
+            f'<joint name="{name}" type="fixed"><origin xyz="{xyz}" rpy="{rpy}"/><parent link="base_link"/>'
+            f'<child link="{name}_link"/></joint><joint name="{name}_optical" type="fixed"><parent link="{name}_link"/>'
+            f'<origin rpy="-1.5707963267948966 0 -1.5707963267948966"/><child link="{name}_optical_frame"/></joint>'
+        )
+    path = written(tmp_path, f'<robot name="car">{"".join(joints)}</robot>', "car.urdf")
+    intrinsics = written(
+        tmp_path, {name: {"K": k_of(name).tolist(), "width": SIZE[0], "height": SIZE[1]} for name in NAMES}
+    )
+    assert_is_the_street(read(intrinsics, None, extrinsics=path).rig)
+    assert len(FACTS) == len(joints)
+
+
+@pytest.mark.parametrize("program", ["COLMAP", "nerfstudio"])
+@pytest.mark.parametrize("layout", ["one image of each camera", "a folder of each camera"])
+def test_a_camera_an_image(tmp_path, program, layout):
+    """COLMAP's default states a camera for each image, and so may nerfstudio."""
+    count = 1 if layout.startswith("one") else 3
+    images = [(name, f"{name}.jpg" if count == 1 else f"{name}/{index}.jpg", 1 + index * 1e-4)
+              for name in NAMES for index in range(count)]  # fmt: skip
+    lines, poses, frames = [], [], []
+    for number, (name, file, factor) in enumerate(images, 1):
+        fx, fy, cx, cy = np.array(four(name)) * [factor, factor, 1, 1] + [0, 0, 0.5, 0.5]
+        lines.append(" ".join(map(str, (number, "OPENCV", *SIZE, fx, fy, cx, cy, *D[:4]))))
+        matrix = np.linalg.inv(pose(name))
+        poses += [" ".join(map(str, (number, *wxyz(matrix), *matrix[:3, 3], number, file))), ""]
+        frame = dict(zip(("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"), [fx, fy, cx, cy, *D], strict=False))
+        frames.append({"file_path": f"images/{file}", "transform_matrix": pose(name, axes=OPENGL).tolist(), **frame})
+    document = {"camera_model": "OPENCV", "w": SIZE[0], "h": SIZE[1], "frames": frames}
+    if program == "COLMAP":
+        written(tmp_path, "\n".join(lines), "cameras.txt")
+        path = written(tmp_path, "\n".join(poses), "images.txt").parent
+    else:
+        path = written(tmp_path, document, "transforms.json")
+    found = read(path)
+    assert sorted(found.rig.names) == sorted(NAMES)
+    for name in NAMES:
+        np.testing.assert_allclose(found.rig[name].ego_from_camera, pose(name), atol=1e-5)
+        np.testing.assert_allclose(found.rig[name].intrinsics, k_of(name), rtol=2e-4)
+    if count > 1:
+        if program == "COLMAP":
+            lines[1] = lines[1].replace("OPENCV 800 450 63", "OPENCV 800 450 75")
+            written(tmp_path, "\n".join(lines), "cameras.txt")
+        else:
+            frames[1]["fl_x"] *= 1.2
+            written(tmp_path, document, "transforms.json")
+        with pytest.raises(InputError, match=f"{NAMES[0]}: its images have focal lengths of 633 to 7"):
+            read(path)
