@@ -158,7 +158,7 @@ def _views(recorded: Recorded, title: str, hidden_layers: tuple[str, ...]) -> rr
 def _scene(recorded: Recorded, titled: str, hidden_layers: tuple[str, ...]) -> rrb.Spatial3DView:
     lines = (*sorted(result.kind for result in recorded.results), entities.FUTURES)
     boxes = ("boxes", "ground_truth", entities.IMAGE_BOXES, entities.MODELS)
-    drawn_in_images = (*boxes, "pillars", "probes", *lines)
+    drawn_in_images = (*boxes, entities.NO_IMAGE, "pillars", "probes", *lines)
     overlays = [entities.overlay(name, kind) for name in recorded.drive.rig.names for kind in drawn_in_images]
     # A map lies on the ground in place of the BEV features.
     hidden = [entities.PILLARS, *([entities.BEV_ON_GROUND] if recorded.map_classes else [])]

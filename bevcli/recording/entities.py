@@ -58,6 +58,11 @@ BEV_GROUND_TRUTH = "bev/ground_truth"
 BEV_MISSED = "bev/ground_truth/missed"
 BEV_PROBES = "bev/probes"
 
+# What a frame without results does not have, beside boxes.
+OF_THE_INSIDE = (
+    BEV_FEATURES, BEV_ON_GROUND, BEV_SEGMENTATION, SEGMENTATION_ON_GROUND, BEV_HISTORY, BEV_PROBES, PROBES
+)  # fmt: skip
+
 MAP = "map"
 MAP_EGO = "map/ego"
 MAP_ROUTE = "map/route"
@@ -71,6 +76,7 @@ EVENTS = "events"
 RUN = "run"
 FUTURES = "futures"  # a kind of lines on the ground
 IMAGE_BOXES = "image_boxes"  # an overlay: the boxes that a detector sees in the image
+NO_IMAGE = "no_image"  # an overlay: the text in place of an image
 # Last parts of the entities below "bev" that are no lines of a model's results.
 OTHER_BELOW_BEV = {
     *("features", "segmentation", "history", "range_rings", "vehicle", "boxes", "tracks", "ground_truth", "probes"),
@@ -146,7 +152,7 @@ def _escaped(name: str) -> str:
 
 def overlay(name: str, kind: str) -> str:
     """The entity of an image overlay. kind: "boxes", "boxes/labels", IMAGE_BOXES, "ground_truth", "pillars",
-    "probes", or a kind of lines on the ground.
+    "probes", NO_IMAGE, or a kind of lines on the ground.
     """
     return f"{camera(name)}/{kind}"
 

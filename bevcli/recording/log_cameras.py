@@ -211,20 +211,40 @@ def transform(parent_from_entity: Array) -> Components:
 
 @dataclass
 class CameraImages:
-    """Writes the images of all cameras. as_video: AV1, in place of the bytes of the image files."""
+    """Writes the images of all cameras.
+
+    Attributes:
+        as_video: AV1, in place of the bytes of the image files.
+        without: the cameras whose last frame had no image.
+    """
 
     stream: rr.RecordingStream
     as_video: bool
+    without: list[str]
     encoders: "dict[str, Av1Encoder]" = field(default_factory=dict)
 
-    def log(self, camera: str, image: CameraImage | None) -> None:
-        """Writes an image. Without one, that of the frame before is cleared, and a video starts anew with the next."""
+    def log(self, camera: Camera, image: CameraImage | None) -> None:
+        """Writes an image. Without one that of the frame before goes, and a text says so."""
+        name, text = camera.name, entities.overlay(camera.name, entities.NO_IMAGE)
+        if image is not None:
+            self._log_image(name, image)
+            if name in self.without:
+                self.without.remove(name)
+                self.stream.log(text, rr.Clear(recursive=False))
+        elif name not in self.without:
+            self.without.append(name)
+            # The viewer goes on to show an encoded image that is cleared as other entities are.
+            cleared = rr.Clear(recursive=False) if self.as_video else rr.EncodedImage.cleared()
+            self.stream.log(entities.image(name), cleared)
+            if name in self.encoders:  # a video starts anew with the next image
+                self.encoders.pop(name).close()
+            middle = camera.width / 2, camera.height / 2
+            label = labels_2d([middle], [f"{name}: no image"], colors=entities.MISSED_COLOR, draw_order=50)
+            log(self.stream, text, label)
+
+    def _log_image(self, camera: str, image: CameraImage) -> None:
         entity = entities.image(camera)
-        if image is None:
-            self.stream.log(entity, rr.Clear(recursive=False))
-            if camera in self.encoders:
-                self.encoders.pop(camera).close()
-        elif self.as_video:
+        if self.as_video:
             if camera not in self.encoders:
                 from bevcli.recording.av1 import Av1Encoder  # needs PyAV
 

@@ -47,6 +47,7 @@ APPLICATION = "bevcli"
 FLUSH_TIMEOUT_S = 20.0
 ROWS_AT_ONCE = 16  # rerun's threads encode so many while ours makes the next ones, not all of a frame at its end
 SPEED_LABEL_M = (1.35, 0.0, 3.2)  # in the ego frame: above the vehicle
+BEHIND = rigid((0.0, 0.0, -1e9))  # from the world to a camera without an image: nothing is drawn into it
 GROUND_OPACITY = 110  # of 255: boxes, rings and the trajectory stay readable on the map
 # Has all columns of tracks, so that the trails of the frame before are cleared.
 NO_BOXES = replace(Boxes3D.empty(), scores=np.zeros(0), instances=np.zeros(0, np.str_))
@@ -74,6 +75,8 @@ class RecordingState:
         world_from_ego: pose of the last frame in the sequence's world; None before the first one.
         colors: of the BEV features, None where these are not drawn.
         tracks: the trails.
+        without_image: cameras that had no image in the last frame.
+        has_truth: the last frame had ground truth.
     """
 
     recording_id: str
@@ -83,6 +86,8 @@ class RecordingState:
     world_from_ego: Pose | None = None
     colors: BevColors | None = None
     tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
+    without_image: list[str] = field(default_factory=list)
+    has_truth: bool = False
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,8 @@ class Recording:
         self._pillars: tuple[Array, NDArray[np.uint32]] | None = None  # of `log_pillars`
         self._seen_cells = SeenCells()
         self._with_meshes = [name for name, settings in recorded.object_classes.items() if settings.mesh]
-        self._images = log_cameras.CameraImages(self._stream, self._options.images == "av1")
+        as_video, without = self._options.images == "av1", self._kept.without_image
+        self._images = log_cameras.CameraImages(self._stream, as_video, without)
         draws_bev = self._options.bev != "none" and self._options.shows_internals
         # Its stamps are predictions.
         self._bev_images = BevImages(self._options.bev, self._kept.colors) if draws_bev else None
@@ -247,12 +253,12 @@ class Recording:
         self._log_ego(frame, moved)
         poses = [moved @ frame.world_from_ego_at[c.name].matrix @ c.ego_from_camera for c in frame.rig.cameras]
         cameras = tuple(
-            PosedCamera(camera, pose, inverse(pose)) for camera, pose in zip(frame.rig.cameras, poses, strict=True)
+            PosedCamera(camera, pose, inverse(pose) if camera.name in frame.images else BEHIND)
+            for camera, pose in zip(frame.rig.cameras, poses, strict=True)
         )
         for posed in cameras:
-            name = posed.camera.name
-            log(stream, entities.camera(name), log_cameras.transform(posed.world_from_camera))
-            self._images.log(name, frame.images.get(name))
+            log(stream, entities.camera(posed.camera.name), log_cameras.transform(posed.world_from_camera))
+            self._images.log(posed.camera, frame.images.get(posed.camera.name))
         self._log_boxes(frame, predicted, frame_poses, cameras)
         if is_first:
             counted = self._recorded.layers or self._recorded.classes
@@ -347,8 +353,9 @@ class Recording:
         else:
             drawn = [self._log_shown(frame.stamp, sides[0], marks, poses)]
             counts = [(sides[0].classes == name).sum() for name in recorded.classes]
-        if truth is not None:
-            drawn.append(self._log_truth(truth, missed, poses))
+        if truth is not None or self._kept.has_truth:  # a frame without labels clears those of the one before
+            drawn.append(self._log_truth(NO_BOXES if truth is None else truth, missed, poses))
+        self._kept.has_truth = truth is not None
         log_cameras.log_boxes_in_images(self._stream, cameras, drawn)
         log(self._stream, entities.BOX_CURVES, components(rr.Scalars, scalars=np.array(counts)))
 
@@ -449,10 +456,12 @@ class Recording:
         pillars, colors = self._pillars
         points = apply(world_from_bev, pillars)
         for posed in cameras:
-            if posed.camera.name in frame.images:
-                log_cameras.log_pillar_hits(stream, posed, points, colors)
+            log_cameras.log_pillar_hits(stream, posed, points, colors)
         if prediction.segmentation is not None:
             self._log_map(self._seen_cells.of(prediction.segmentation, frame, grid), ego_from_bev)
+        if prediction.failure:
+            overlays = [entities.overlay(posed.camera.name, "probes") for posed in cameras]
+            self._clear(*entities.OF_THE_INSIDE, *overlays)
         if self._bev_images is not None and prediction.bev is not None:
             features = prediction.bev.detach().float().cpu().numpy().reshape(grid.rows, grid.columns, -1)
             self._log_bev_images(self._bev_images.push(prediction, features))
@@ -460,7 +469,7 @@ class Recording:
         if (attention := prediction.attention) is None:
             return
         if attention.history_weight is None:  # no history was used
-            stream.log(entities.BEV_HISTORY, rr.Clear(recursive=False))
+            self._clear(entities.BEV_HISTORY)
         else:
             log_flat_image(stream, entities.BEV_HISTORY, entities.colormap(attention.history_weight[::-1]), ranges, -8)
         if attention.probes:
@@ -474,13 +483,17 @@ class Recording:
         """Writes a map into the BEV view and on the ground of the scene; None clears that of the frame before."""
         flat, on_ground = entities.BEV_SEGMENTATION, entities.SEGMENTATION_ON_GROUND
         if ground_map is None:
-            for entity in (flat, on_ground):
-                self._stream.log(entity, rr.Clear(recursive=False))
+            self._clear(flat, on_ground)
             return
         painted = ground_map.painted(entities.map_colors(ground_map.classes), entities.BACKGROUND)
         of_map = ground_map.x_range_m, ground_map.y_range_m
         log_flat_image(self._stream, flat, painted, of_map, -5)
         log_on_ground(self._stream, on_ground, painted, of_map, ego_from_bev, 255)
+
+    def _clear(self, *of_entities: str) -> None:
+        """Clears what entities show of the frame before."""
+        for entity in of_entities:
+            self._stream.log(entity, rr.Clear(recursive=False))
 
     def _log_bev_images(self, ready: list[tuple[Prediction, NDArray[np.uint8]]]) -> None:
         for prediction, image in ready:

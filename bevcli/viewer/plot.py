@@ -81,9 +81,11 @@ def _camera_image(
     """The image of a camera in some size with the boxes, (height, width, 3)."""
     scaled = camera.scaled(width / camera.width, height / camera.height)
     image = frame.images.get(camera.name)
-    canvas = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
-    if image is not None:
-        canvas[:] = cv2.resize(image.pixels_bgr, (width, height), interpolation=cv2.INTER_AREA)
+    if image is None:
+        canvas = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
+        draw_title(canvas, camera.name, has_image=False)
+        return canvas
+    canvas = cv2.resize(image.pixels_bgr, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
     world_from_camera = frame.world_from_ego_at[camera.name].matrix @ camera.ego_from_camera
     posed = PosedCamera(scaled, world_from_camera, inverse(world_from_camera))
     world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
@@ -98,7 +100,7 @@ def _camera_image(
     size = max(0.36, width * LABEL_SHARE)
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
         draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own_colors[box]), size, centered=True)
-    draw_title(canvas, camera.name, has_image=image is not None)
+    draw_title(canvas, camera.name, has_image=True)
     if prediction.untrained:
         draw_text(canvas, UNTRAINED, (width // 2, height - 14), WARNING, 0.42, centered=True)
     return canvas

@@ -14,7 +14,7 @@ from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, rec
 
 from bevcli.cli.run import _frame_warnings
 from bevcli.errors import OutputError
-from bevcli.frame import CameraImage, NewStart, StartReason
+from bevcli.frame import BevMap, CameraImage, NewStart, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import entities
@@ -141,9 +141,41 @@ def test_the_encoded_bytes_of_an_image_file_are_kept(tmp_path):
 def test_a_dropped_image_clears_the_view_and_logs_an_event(tmp_path):
     record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=3))
     recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
-    shown = [frame.has(entities.image("CAM_BACK"), "EncodedImage:blob") for frame in recorded]
+    shown = [bool(frame.blob(entities.image("CAM_BACK"), "EncodedImage:blob")) for frame in recorded]
     assert shown == [True, False, True]
+    texts = [frame.texts(entities.overlay("CAM_BACK", entities.NO_IMAGE), "Points2D:labels") for frame in recorded]
+    assert texts == [[], ["CAM_BACK: no image"], []]
     assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK has no image: missing"]
+
+
+def test_no_box_is_drawn_where_a_camera_has_no_image(tmp_path):
+    record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_FRONT",)}, count=3))
+    recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
+    for kind in ("boxes", "ground_truth"):
+        drawn = [len(frame.strips(entities.overlay("CAM_FRONT", kind), "LineStrips2D:strips")) for frame in recorded]
+        assert drawn[0] == drawn[2] > drawn[1] == 0
+    assert recorded[1].texts(entities.BOXES, "name") == ["car", "pedestrian"]
+
+
+def test_a_frame_without_results_shows_none_of_the_one_before(tmp_path):
+    drive = MemoryDrive(4)
+    ground_map = BevMap(np.ones((4, 4), np.uint8), (-10, 10), (-10, 10))
+    with Recording(tmp_path / "r.rrd", drive, NamedModel(), RecordingOptions(probes=((0, 10),))) as recording:
+        for frame in map(drive.load, range(4)):
+            found = replace(predict(frame), segmentation=ground_map)
+            if frame.stamp.index == 2:
+                recording.log(frame, replace(found, bev=None, attention=None, segmentation=None, skipped=True))
+            else:
+                recording.log(with_truth(frame), found)
+    recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
+    flat = (entities.BEV_FEATURES, entities.BEV_SEGMENTATION, entities.BEV_HISTORY)
+    of_frames = [{entity: frame.has(entity, "Image:buffer") for entity in flat} for frame in recorded]
+    assert of_frames == [dict.fromkeys(flat, index != 2) for index in range(4)]
+    for entity in (entities.BEV_ON_GROUND, entities.SEGMENTATION_ON_GROUND):
+        assert [frame.has(entity, "Mesh3D:vertex_positions") for frame in recorded] == [True, True, False, True]
+    for entity in (entities.BEV_PROBES, entities.overlay("CAM_FRONT", "probes")):
+        assert [len(frame.array(entity, "Points2D:positions", 2)) for frame in recorded] == [1, 1, 0, 1]
+    assert [len(frame.texts(entities.MISSED, "name")) for frame in recorded] == [1, 1, 0, 1]
 
 
 def test_a_recording_of_an_untrained_model_is_labelled(tmp_path):

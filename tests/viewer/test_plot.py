@@ -80,7 +80,7 @@ def test_a_missing_image_leaves_its_place_dark(prediction):
     kept = {name: image for name, image in frame.images.items() if name != "CAM_FRONT"}
     image = replace(prediction, frame=replace(frame, images=kept)).plot("CAM_FRONT")
     assert (image[-20:] == (25, 20, 18)).all()
-    assert of_color(image, "car").any()
+    assert not of_color(image, "car").any()
 
 
 def test_mistakes_in_the_arguments_of_a_plot_are_named(prediction):

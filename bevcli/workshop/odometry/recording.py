@@ -90,8 +90,10 @@ def _log_frame(
     vehicle = rr.Arrows2D(origins=[start], vectors=[end - start], colors=entities.EGO_COLOR, radii=radii)
     stream.log(f"{WAY}/vehicle", vehicle)
     stream.log(f"{ROAD}/image", rr.EncodedImage(contents=drive.road[index], media_type="image/jpeg"))
-    for name, encoded in drive.images.get(index, {}).items():
-        stream.log(f"{CAMERAS}/{name}/image", rr.EncodedImage(contents=encoded, media_type="image/jpeg"))
+    for name in drive.rig.names if index in drive.images else ():
+        contents = drive.images[index].get(name)
+        file = rr.EncodedImage(contents=contents, media_type="image/jpeg") if contents else rr.EncodedImage.cleared()
+        stream.log(f"{CAMERAS}/{name}/image", file)
     if index == 0:
         return
     for name, (values, deviations) in zip(CURVES, (speeds(motion), yaw_rates_deg(motion)), strict=True):
