@@ -3,6 +3,8 @@
 FFV1 is lossless, so pixels are compared exactly.
 """
 
+from fractions import Fraction
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from small_drive import CAMERAS, SIZE, image_of
 from bevcli.errors import InputError
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.videos import VideoReader
+from bevcli.workshop.formats.video_times import container_times_ns
 
 
 def write_video(path, images, rate, codec="FFV1"):
@@ -146,3 +149,47 @@ def test_motion_jpeg_is_read(videos):
     (videos / "videos/CAM_BACK.avi").unlink()
     write_video(videos / "videos/CAM_BACK.avi", [image_of("CAM_BACK", n) for n in range(5)], 5, "MJPG")
     assert open_sequence(videos, ego_motion="static").load(4).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
+
+
+UNEVEN_MS = [0, 500, 1000, 1500, 2000, 3500, 5000, 5040, 6500]
+WRITTEN = {
+    "plain.mp4": ("mpeg4", {}, {}), "fragments.mp4": ("mpeg4", {}, {"movflags": "frag_keyframe+empty_moov"}),
+    "reordered.mov": ("libx264", {"bf": "2", "g": "9"}, {}), "v.mkv": ("ffv1", {}, {}), "v.webm": ("libvpx", {}, {}),
+    "live.mkv": ("mpeg4", {}, {"live": "1"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_video_of_uneven_rate_has_the_times_of_its_container(tmp_path, name):
+    """As phones and dashboard cameras write them."""
+    av = pytest.importorskip("av")
+    codec, options, container_options = WRITTEN[name]
+    with av.open(str(tmp_path / name), "w", options=container_options) as container:
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 1000)
+        for number, time in enumerate(UNEVEN_MS):
+            frame = av.VideoFrame.from_ndarray(image_of("CAM_FRONT", number), format="bgr24").reformat(format="yuv420p")
+            frame.pts, frame.time_base = time, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    np.testing.assert_allclose(container_times_ns(tmp_path / name) / 1e6, UNEVEN_MS, atol=1)
+    if name != "live.mkv":  # which does not state how long it is
+        how = {"fov_deg": 65, "height": 1.5, "ego_motion": "static"}
+        sequence = open_sequence(tmp_path / name, **how, start_ns=10**9)
+        np.testing.assert_allclose([each.timestamp_ns / 1e6 - 1000 for each in sequence.stamps], UNEVEN_MS, atol=1)
+        assert any("9 images at uneven times, those of the container, from" in note for note in sequence.notes)
+        even = open_sequence(tmp_path / name, **how, image_rate_hz=2)
+        assert [stamp.timestamp_ns for stamp in even.stamps[:3]] == [0, 500_000_000, 1_000_000_000]
+
+
+@pytest.mark.parametrize("rate", [10, 29.97])
+@pytest.mark.parametrize(("suffix", "codec"), [("mp4", "mp4v"), ("mkv", "FFV1"), ("avi", "FFV1")])
+def test_the_times_of_an_even_video_are_those_of_its_rate(tmp_path, rate, suffix, codec):
+    path = tmp_path / f"v.{suffix}"
+    write_video(path, [image_of("CAM_FRONT", n) for n in range(20)], rate, codec)
+    times = container_times_ns(path)
+    assert (times is None) == (suffix == "avi")
+    sequence = open_sequence(path, fov_deg=65, height=1.5, ego_motion="static")
+    assert [each.timestamp_ns for each in sequence.stamps] == [round(n * 1e9 / rate) for n in range(20)]
+    assert times is None or np.abs(times - [n * 1e9 / rate for n in range(20)]).max() < 1e6

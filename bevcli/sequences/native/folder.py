@@ -64,8 +64,9 @@ class FolderDrive(ListedDrive):
             from bevcli.workshop.formats.first_images import cameras_with_images
             from bevcli.workshop.formats.unlisted import covered, find_frames
 
-            used, left_out = cameras_with_images(rig.names, path)
-            rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
+            if not (path / "videos").is_dir():
+                used, left_out = cameras_with_images(rig.names, path)
+                rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             frames = find_frames(path, rig.names, own, motion, has_poses=has_poses)
             poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0])))

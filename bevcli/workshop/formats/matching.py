@@ -25,12 +25,14 @@ class CameraImages:
         times_ns: (N,) int64, increasing.
         period_ns: from one image to the next.
         image: an image by its index.
+        is_uneven: the times are not evenly spaced, in a video.
     """
 
     name: str
     times_ns: NDArray[np.int64]
     period_ns: float
     image: Callable[[int], ImageSource]
+    is_uneven: bool = False
 
     def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -28,9 +29,12 @@ from bevcli.sequences.videos import count_and_rate
 from bevcli.workshop.formats.camera_names import match_names, renamed
 from bevcli.workshop.formats.matching import CameraImages, Matched, match, measured_periods
 from bevcli.workshop.formats.name_times import NUMBER, Reading, read_names
+from bevcli.workshop.formats.video_times import container_times_ns
 
 FILE_NAME = "timing.toml"
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
+UNEVEN = 0.1  # of the period of a video: images farther from even times are at those of the container
+UNEVEN_TEXT = "at uneven times, those of the container"
 Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understood
 
 
@@ -207,9 +211,12 @@ def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timin
 def _matched(cameras: Mapping[str, CameraImages], matched: Matched) -> str:
     """The rates of cameras and how they were matched, in words."""
     rates = sorted({f"{1e9 / each.period_ns:.1f}" for each in cameras.values()}, key=float)
+    uneven = [each.name for each in cameras.values() if each.is_uneven]
     parts = [f"{counted(len(cameras), 'cameras')} at {' to '.join(rates[:: max(len(rates) - 1, 1)])} Hz"]
     if len(cameras) > 1:
         parts.append(f"matched to {matched.leading} within {np.ceil(matched.farthest_ns / 1e6):.0f} ms")
+    if uneven:
+        parts.append(f"{', '.join(uneven)} {UNEVEN_TEXT}")
     return ", ".join([*parts, _missing(matched.missing, len(matched.entries) * len(cameras))])
 
 
@@ -304,9 +311,19 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
 def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) -> CameraImages:
     """The images of a video. start_ns: time of the first. rate_hz: default the one stated in the video.
 
-    Raises InputError.
+    Where the images are not evenly spaced, their times are those of the container. Raises InputError.
     """
     count, own_rate_hz = count_and_rate(path)
-    rate_hz = rate_hz or own_rate_hz
-    times = start_ns + np.round(np.arange(count) * 1e9 / rate_hz).astype(np.int64)
-    return CameraImages(path.name, times, 1e9 / rate_hz, lambda index: ImageSource(path, int(times[index]), index))
+    times = np.round(np.arange(count) * 1e9 / (rate_hz or own_rate_hz)).astype(np.int64)
+    stated = container_times_ns(path) if rate_hz is None else None
+    period = 1e9 / (rate_hz or own_rate_hz)
+    is_uneven = stated is not None and len(stated) > 1 and _is_uneven(stated, period)
+    if stated is not None and is_uneven:
+        times, period = stated, float(np.median(np.diff(stated)))
+    times = start_ns + times
+    return CameraImages(path.name, times, period, lambda index: ImageSource(path, int(times[index]), index), is_uneven)
+
+
+def _is_uneven(times_ns: NDArray[np.int64], period_ns: float) -> bool:
+    """True where an image is farther than `UNEVEN` of a period from where even ones would be."""
+    return bool(np.abs(times_ns - np.arange(len(times_ns)) * period_ns).max() > UNEVEN * period_ns)

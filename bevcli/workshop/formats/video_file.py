@@ -14,7 +14,7 @@ from bevcli.sequences.native.folder import check_covered
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import rotation_notes
 from bevcli.workshop.formats.calibrations import SEVERAL
-from bevcli.workshop.formats.unlisted import covered, video_images
+from bevcli.workshop.formats.unlisted import UNEVEN_TEXT, covered, video_images
 
 
 def open_video(path: Path, common: InputOptions, options: FolderOptions) -> ListedDrive:
@@ -37,7 +37,8 @@ def open_video(path: Path, common: InputOptions, options: FolderOptions) -> List
         for index, time in enumerate(video.times_ns)
     )
     start = "time 0 (state `start_ns` (`--start-ns`))" if options.start_ns is None else f"{options.start_ns} ns"
-    understood = f"{len(entries)} images at {1e9 / video.period_ns:g} Hz from {start} on"
+    rate = f"{UNEVEN_TEXT}," if video.is_uneven else f"at {1e9 / video.period_ns:g} Hz"
+    understood = f"{len(entries)} images {rate} from {start} on"
     poses = ReadPoses(None)
     if options.ego_motion_file is not None and common.ego_motion != "static":
         poses = read_poses(options.ego_motion_file, DrivePoses(rig, options, video.times_ns))
