@@ -24,6 +24,7 @@ OWN: dict[Group, dict[str, str]] = {
     "bevcli.sequences": {
         "argoverse2": "bevcli.workshop.formats:Argoverse2Options",
         "dgp": "bevcli.workshop.formats:DgpScene",
+        "kitti": "bevcli.workshop.formats:KittiDrive",
         "native": "bevcli.sequences.native:NativeFolder",
         "nuscenes": "bevcli.sequences.nuscenes:NuScenesOptions",
         "ros": "bevcli.workshop.formats:BagOptions",

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from bevcli.errors import InputError
+from bevcli.geometry.transforms import GeoOrigin
 from bevcli.sequences.open import open_sequence
 
 STREET = Path(__file__).parents[2] / "samples/street"
@@ -84,3 +85,97 @@ def test_the_time_of_the_first_image_may_be_stated_for_any_times(tmp_path):
     sequence = open_sequence(drive, **how, start_ns=1_200_000_000)
     assert [stamp.timestamp_ns for stamp in sequence.stamps[:2]] == [1_200_000_000, 1_700_000_000]
     assert "seconds since 1970, moved so that the first is 1200000000 ns" in " ".join(sequence.notes)
+
+
+# KITTI. The vehicle drives along x at 10 m/s and turns left; the Velodyne is 0.76 m ahead and 1.73 m up.
+K = np.array([[633.0, 0, 400], [0, 633, 225], [0, 0, 1]])
+CAMERA_FROM_VELODYNE = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+VELODYNE_FROM_IMU = np.array([[1.0, 0, 0, -0.81], [0, 1, 0, 0.32], [0, 0, 1, -0.8], [0, 0, 0, 1]])
+EGO_FROM_VELODYNE = np.array([[1.0, 0, 0, 0.76], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])
+BASELINES = {0: 0.0, 1: -0.54, 2: 0.06, 3: -0.48}  # of the cameras, from camera 0 to the left
+
+
+def world_from_ego(index: int) -> np.ndarray:
+    yaw, pose = 0.02 * index, np.eye(4)
+    pose[:2, :2], pose[:2, 3] = (
+        [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]],
+        [5.0 * index, 0.05 * index**2],
+    )
+    return pose
+
+
+def rows(**matrices: np.ndarray) -> str:
+    return "".join(f"{name}: {' '.join(f'{value:.12e}' for value in np.ravel(of))}\n" for name, of in matrices.items())
+
+
+def kitti_odometry(root: Path, poses: str) -> Path:
+    drive = images_of(root / "sequences/07", "image_2", "image_3")
+    projections = {f"P{key}": K @ np.c_[np.eye(3), [x, 0, 0]] for key, x in BASELINES.items()}
+    (drive / "calib.txt").write_text(rows(**projections, Tr=CAMERA_FROM_VELODYNE[:3]))
+    (drive / "times.txt").write_text("".join(f"{0.5 * index:e}\n" for index in range(4)))
+    camera0_from_ego = CAMERA_FROM_VELODYNE @ np.linalg.inv(EGO_FROM_VELODYNE)
+    start = np.linalg.inv(camera0_from_ego @ np.linalg.inv(world_from_ego(0)))
+    lines = [np.linalg.inv(start) @ world_from_ego(n) @ np.linalg.inv(camera0_from_ego) for n in range(4)]
+    (root / poses).parent.mkdir(exist_ok=True, parents=True)
+    (root / poses).write_text("".join(" ".join(f"{value:.9e}" for value in line[:3].ravel()) + "\n" for line in lines))
+    return drive
+
+
+def kitti_raw(root: Path) -> Path:
+    day = root / "2011_09_26"
+    drive = images_of(day / "2011_09_26_drive_0001_sync", "image_02/data", "image_03/data", "oxts/data")
+    for file in (drive / "oxts/data").iterdir():
+        file.unlink()
+    stamps = "".join(f"2011-09-26 13:02:{25 + index / 2:012.9f}\n" for index in range(4))
+    for folder in ("image_02", "image_03", "oxts"):
+        (drive / folder / "timestamps.txt").write_text(stamps)
+    sizes = {f"S_rect_0{key}": np.array([800.0, 450]) for key in BASELINES}
+    projections = {f"P_rect_0{key}": K @ np.c_[np.eye(3), [x, 0, 0]] for key, x in BASELINES.items()}
+    (day / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n" + rows(**sizes, R_rect_00=np.eye(3), **projections)
+    )
+    for name, matrix in (("velo_to_cam", CAMERA_FROM_VELODYNE), ("imu_to_velo", VELODYNE_FROM_IMU)):
+        (day / f"calib_{name}.txt").write_text(rows(R=matrix[:3, :3], T=matrix[:3, 3]))
+    ego_from_imu = EGO_FROM_VELODYNE @ VELODYNE_FROM_IMU
+    for index in range(4):
+        pose = world_from_ego(index) @ ego_from_imu
+        place = GeoOrigin(49.0, 8.4).latitude_longitude(pose[:2, 3])
+        numbers = [*place, 110 + pose[2, 3], 0, 0, np.arctan2(pose[1, 0], pose[0, 0]), *[0] * 24]
+        (drive / f"oxts/data/{index:010d}.txt").write_text(" ".join(f"{number:.12f}" for number in numbers))
+    return drive
+
+
+@pytest.mark.parametrize("layout", ["raw", "poses/07.txt", "sequences/07/poses.txt", "sequences/07/07.txt"])
+def test_kitti_as_it_lies_on_disk(tmp_path, layout):
+    drive = kitti_raw(tmp_path) if layout == "raw" else kitti_odometry(tmp_path, layout)
+    sequence = open_sequence(drive)
+    names = ("image_02", "image_03") if layout == "raw" else ("image_2", "image_3")
+    assert sequence.rig.names == names
+    for name in names:
+        pose = sequence.rig[name].ego_from_camera
+        np.testing.assert_allclose(pose[:3, 3], [1.03, BASELINES[int(name[-1])], 1.65], atol=1e-6)
+        np.testing.assert_allclose(pose[:3, 2], [1, 0, 0], atol=1e-6)
+    times = [stamp.timestamp_ns - sequence.stamps[0].timestamp_ns for stamp in sequence.stamps]
+    assert times == [0, 500_000_000, 1_000_000_000, 1_500_000_000]
+    assert layout != "raw" or sequence.stamps[0].timestamp_ns == 1_317_042_145_000_000_000
+    poses = [sequence.load(index).world_from_ego.matrix for index in range(4)]
+    for index in range(1, 4):
+        found = np.linalg.inv(poses[0]) @ poses[index]
+        np.testing.assert_allclose(found, np.linalg.inv(world_from_ego(0)) @ world_from_ego(index), atol=5e-3)
+    assert not any("assumed" in note and "Hz" in note for note in sequence.notes)
+
+
+def test_a_mistake_in_a_drive_of_kitti_is_one_line(tmp_path):
+    drive = kitti_raw(tmp_path)
+    (drive / "oxts/data/0000000002.txt").write_text("1 2 3")
+    with pytest.raises(InputError, match=r"0000000002.txt: expected 30 finite numbers"):
+        open_sequence(drive)
+    (drive / "oxts/data/0000000002.txt").unlink()
+    with pytest.raises(InputError, match=r"oxts: has 4 times and 3 files in data"):
+        open_sequence(drive)
+    (drive.parent / "calib_cam_to_cam.txt").unlink()
+    with pytest.raises(InputError, match=r"has no calibration \(expected calib.txt, or calib_cam_to_cam.txt"):
+        open_sequence(drive)
+    assert open_sequence(
+        drive, fov_deg=65, height=1.65, yaw_deg={"image_02": 0, "image_03": 0}, ego_motion="static"
+    ).rig

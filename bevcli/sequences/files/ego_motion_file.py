@@ -84,6 +84,8 @@ def _is_own(path: Path) -> bool:
     """True for a file with the header of ego_motion.csv; and for one that is missing, which its reader says."""
     if not is_there(path):
         return True
+    if path.is_dir():
+        return False
     with open_regular(path) as file:
         head = file.readline(1000)
     return b"timestamp_ns" in head and b"qw" in head

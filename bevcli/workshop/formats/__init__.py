@@ -30,6 +30,7 @@ ARGOVERSE2_FILES = (
 )
 DGP_FOLDERS = ("calibration", "ontology", "rgb")  # a folder with these is a scene that lacks its file
 T4_TABLES = ("scene", "sample", "sample_data")  # any of them makes a folder a T4 dataset
+NATIVE_FILES = ("calibration.json", "frames.csv", "ego_motion.csv")
 AXLE_HEIGHT_M = 0.33
 BAG_SUFFIXES = (".mcap", ".db3")
 PACKED = (".zst", ".zstd", ".lz4", ".gz", ".xz", ".bz2")
@@ -89,6 +90,25 @@ class T4Dataset(Format):
     def recognises(cls, path: Path) -> bool:
         """True for a folder with a table of a T4 dataset."""
         return any((path / "annotation" / f"{name}.json").exists() for name in T4_TABLES)
+
+
+@options("Input")
+class KittiDrive(FolderOptions, Format):
+    """A drive of KITTI odometry or KITTI raw."""
+
+    name = "a KITTI drive"
+    expected = "image_2 and calib.txt, or image_02/data"
+    reader = "bevcli.workshop.formats.kitti_drive:open_kitti"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True for a folder with KITTI's folders of images, unless it has a file of a sequence folder."""
+        if not path.is_dir() or any((path / name).exists() for name in NATIVE_FILES):
+            return False
+        if any((path / f"image_0{number}/data").is_dir() for number in range(4)):
+            return True
+        has_images = any((path / f"image_{number}").is_dir() for number in range(4))
+        return has_images and ((path / "calib.txt").exists() or (path / "times.txt").exists())
 
 
 @options("Input")

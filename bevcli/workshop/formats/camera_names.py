@@ -15,6 +15,7 @@ WORD = re.compile(r"camera|cam|image|img|front|forward|back|rear|left|right|[a-z
 NUMBERED = re.compile(r"(image|img)_?\d+")  # such as image_2 of KITTI
 ANY = {"camera", "cam", "image", "img"}  # words that tell no camera from another
 DIRECTIONS = {"front", "back", "left", "right"}
+INSIDE = ("data", "data_rect")  # folders in that of a camera
 LOOKED_AT = 50  # entries of a folder
 
 
@@ -47,6 +48,11 @@ def renamed(matched: Mapping[str, str]) -> str:
     return "" if not pairs else f"; {', '.join(pairs)}"
 
 
+def folder_of_images(path: Path) -> Path:
+    """The folder of a camera's images: the camera's own, or one inside, as KITTI and EuRoC have it."""
+    return next((path / name for name in INSIDE if (path / name).is_dir()), path)
+
+
 def has_camera_folders(path: Path) -> bool:
     """True for a folder with a folder of images that is named like a camera."""
     return path.is_dir() and any(_is_camera_folder(folder) for folder in path.iterdir())
@@ -56,4 +62,5 @@ def _is_camera_folder(path: Path) -> bool:
     named = "cam" in path.name.lower() or words_of(path.name) & DIRECTIONS or NUMBERED.fullmatch(path.name.lower())
     if not named or not path.is_dir():
         return False
-    return any(file.suffix.lower() in IMAGE_SUFFIXES for file, _ in zip(path.iterdir(), range(LOOKED_AT), strict=False))
+    files = (file for file, _ in zip(folder_of_images(path).iterdir(), range(LOOKED_AT), strict=False))
+    return any(file.suffix.lower() in IMAGE_SUFFIXES for file in files)

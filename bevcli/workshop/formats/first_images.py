@@ -11,7 +11,7 @@ from bevcli.parsing.documents import CSV_BYTES, name_of
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text
 from bevcli.parsing.images import size_of_image
 from bevcli.sequences.videos import size_of_video
-from bevcli.workshop.formats.camera_names import match_names
+from bevcli.workshop.formats.camera_names import folder_of_images, match_names
 
 LARGEST_IMAGE = 256 * MIB
 OTHERS = ("frame", "scene", "timestamp_ns")  # columns of frames.csv that are no cameras
@@ -66,7 +66,7 @@ def _listed(table: Path) -> dict[str, Path]:
 
 
 def _first_in(folder: Path) -> Path | None:
-    names = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    names = (path for path in folder_of_images(folder).iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     return min(names, default=None)
 
 

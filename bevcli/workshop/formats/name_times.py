@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from decimal import Decimal
 from itertools import chain
 from pathlib import Path
 
@@ -211,18 +212,27 @@ def _scaled(text: str, factor: int) -> int:
     return int(whole) * factor + (int(fraction or 0) * factor + scale // 2) // scale
 
 
+def scaled_ns(seconds: str) -> int | None:
+    """The nanoseconds of a decimal number of seconds, such as 1.5 or 1.5e+00; None for another text."""
+    try:
+        return round(Decimal(seconds) * 10**9)
+    except (ArithmeticError, ValueError):
+        return None
+
+
 def _dates(names: Texts) -> Reading | None:
     """The dates in the names, None where one has none, or two of a camera are equal."""
     values = {}
     for camera, of_camera in names.items():
-        numbers = [_date_ns(name) for name in of_camera]
+        numbers = [date_ns(name) for name in of_camera]
         if None in numbers or len(set(numbers)) < len(numbers):
             return None
         values[camera] = np.array(numbers, dtype=np.int64)
     return Reading("date", values, " in UTC")
 
 
-def _date_ns(name: str) -> int | None:
+def date_ns(name: str) -> int | None:
+    """The time, ns since 1970, of a date in UTC that a text has; None where it has none."""
     date = DATE.search(name)
     if date is None:
         return None

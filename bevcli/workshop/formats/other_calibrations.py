@@ -256,8 +256,13 @@ def _camera0_from_velodyne(rows: Mapping[str, Array], file: Path) -> Array | Non
     beside = file.parent / "calib_velo_to_cam.txt"
     if not beside.exists():
         return None
-    rows_beside = _kitti_rows(beside)
-    return rigid(_row(rows_beside, "T", 3, beside), _row(rows_beside, "R", 9, beside).reshape(3, 3))
+    return kitti_transform(beside)
+
+
+def kitti_transform(path: Path) -> Array:
+    """(4, 4) of R and T in one of KITTI's files: calib_imu_to_velo.txt has velodyne_from_imu. Raises InputError."""
+    rows = _kitti_rows(path)
+    return rigid(_row(rows, "T", 3, path), _row(rows, "R", 9, path).reshape(3, 3))
 
 
 def _kitti_rows(path: Path) -> dict[str, Array]:

@@ -27,6 +27,7 @@ from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
 from bevcli.sequences.native import TimeKind
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
+from bevcli.workshop.formats.oxts import read_oxts
 from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
@@ -116,6 +117,8 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
 
     Raises InputError for a file that lacks something, or that can be read in two ways.
     """
+    if path.is_dir():
+        return read_oxts(path)
     table = read_table(path)
     name = None if table is None else next((name for name, layout in KINDS.items() if layout.is_it(table)), None)
     if table is None or name is None:

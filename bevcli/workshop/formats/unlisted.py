@@ -26,7 +26,8 @@ from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.sequences.native import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
 from bevcli.sequences.videos import count_and_rate
-from bevcli.workshop.formats.camera_names import match_names, renamed
+from bevcli.workshop.formats.camera_names import folder_of_images, match_names, renamed
+from bevcli.workshop.formats.listed_times import listed_times
 from bevcli.workshop.formats.matching import CameraImages, Matched, match, measured_periods
 from bevcli.workshop.formats.name_times import NUMBER, Reading, read_names
 from bevcli.workshop.formats.video_times import container_times_ns
@@ -167,7 +168,7 @@ def _from_names(folder: Path, timing: Timing, motion: EgoMotion | None, has_pose
                 f"{folder / camera}: the folder is missing (the calibration has the camera {camera}; found {others}): "
                 "name the folder like the camera"
             )
-    paths = {camera: _image_files(folder / name) for camera, name in matched.items()}
+    paths = {camera: _image_files(folder_of_images(folder / name)) for camera, name in matched.items()}
     names = {camera: [path.stem for path in of_camera] for camera, of_camera in paths.items()}
     reading = read_names(folder, names, motion, timing.times)
     if reading.kind == "index":
@@ -236,16 +237,37 @@ def _from_indices(
     numbered = {camera: dict(zip(reading.values[camera].tolist(), of, strict=True)) for camera, of in paths.items()}
     numbers = sorted(set().union(*numbered.values()))
     _check_numbers(folder, numbered)
-    times, how = _times_of_indices(folder, numbers, timing, motion, has_poses)
+    stated = _listed_times(folder, numbered, timing)
+    if stated is None:
+        times, how = _times_of_indices(folder, numbers, timing, motion, has_poses)
+        time_of = dict(zip(numbers, times, strict=True))
+        stated = dict.fromkeys(numbered, time_of), how
+    times_of, how = stated
     entries, missing = [], 0
-    for number, time in zip(numbers, times, strict=True):
+    for number in numbers:
         there = {camera: of[number] for camera, of in numbered.items() if number in of}
-        sources = {camera: ImageSource(path, time + timing.cameras[camera].offset_ns) for camera, path in there.items()}
+        sources = {camera: ImageSource(path, times_of[camera][number] + timing.cameras[camera].offset_ns)
+                   for camera, path in there.items()}  # fmt: skip
+        time = times_of[next(iter(there))][number]
         dropped = {camera: f"no image {number} in {of_camera[0].parent}" for camera, of_camera in paths.items()
                    if camera not in there}  # fmt: skip
         missing += len(dropped)
         entries.append(FrameEntry(FrameStamp(number, "", time), sources, dropped, f"{folder}: image {number}"))
     return tuple(entries), f"numbered images {how}, {_missing(missing, len(entries) * len(paths))}"
+
+
+def _listed_times(
+    folder: Path, numbered: Mapping[str, Mapping[int, Path]], timing: Timing
+) -> tuple[dict[str, dict[int, int]], str] | None:
+    """The times of the images by camera and number that files beside them list, and their words; None without."""
+    found = {camera: listed_times(folder, next(iter(of.values())).parent, of) for camera, of in numbered.items()}
+    listed = {camera: each for camera, each in found.items() if each is not None}
+    if timing.rate_hz is not None or len(listed) < len(numbered):
+        return None
+    first = min(min(times.values()) for times, _ in listed.values())
+    moved = 0 if timing.start_ns is None else timing.start_ns - first
+    times = {camera: {number: time + moved for number, time in of.items()} for camera, (of, _) in listed.items()}
+    return times, f"with the times of {next(iter(listed.values()))[1]}"
 
 
 def _check_numbers(folder: Path, numbered: Mapping[str, Mapping[int, Path]]) -> None:
