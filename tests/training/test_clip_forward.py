@@ -106,7 +106,8 @@ SHORT = TrainingConfig(
 )
 
 
-@pytest.mark.parametrize("learn", [pytest.param("last", marks=pytest.mark.slow), "all"])
+@pytest.mark.slow
+@pytest.mark.parametrize("learn", ["last", "all"])
 def test_resumed_training_with_a_window_equals_an_uninterrupted(tmp_path: Path, learn: str) -> None:
     settings = replace(SHORT, clips=replace(SHORT.clips, learn=learn))
     whole = trained(tmp_path / "whole", settings)

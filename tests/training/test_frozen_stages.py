@@ -49,13 +49,6 @@ def test_more_frozen_stages_than_the_backbone_has_are_all_of_it() -> None:
         assert not one.requires_grad
 
 
-def test_frozen_stages_add_nothing_to_the_state_of_the_backbone() -> None:
-    backbone = made_backbone()
-    names = set(backbone.state_dict())
-    with FrozenStages(backbone, 1, torch.float32).used_by(backbone):
-        assert set(backbone.state_dict()) == names
-
-
 def test_several_processes_leave_frozen_parts_without_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a gradient of zero, weight decay would change them."""
     monkeypatch.setattr("torch.distributed.all_reduce", lambda sums: sums.mul_(2))

@@ -52,13 +52,13 @@ def assert_equal(one: Any, other: Any) -> None:
     assert all(np.array_equal(a.numpy(), b.numpy(), equal_nan=a.is_floating_point()) for a, b in pairs)
 
 
-def test_batches_are_equal_for_any_number_of_loaders() -> None:
+@pytest.mark.parametrize("loaders", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_batches_are_equal_for_any_number_of_loaders(loaders: int) -> None:
     turns, made = [(0, 0), (1, 0), (2, 0)], maker(in_bytes=True)
-    for loaders in (1, 2):
-        with closing(loaded_batches(made, turns, loaders)) as batches:
-            for turn, batch in zip(turns, batches, strict=True):
-                assert batch.inputs[0].images.dtype == torch.uint8
-                assert_equal(batch, made(*turn))
+    with closing(loaded_batches(made, turns, loaders)) as batches:
+        for turn, batch in zip(turns, batches, strict=True):
+            assert batch.inputs[0].images.dtype == torch.uint8
+            assert_equal(batch, made(*turn))
 
 
 @pytest.mark.slow
