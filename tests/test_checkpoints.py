@@ -1,18 +1,17 @@
 """Weights files: reading, checking, converting, and one-line errors for files that cannot be used."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import math
 import pickle
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import safetensors.torch
 import torch
+from memory_drive import make_rig
+from small_model import small_model
 from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
@@ -36,11 +35,6 @@ from bevcli.model.parts import model_parts
 from bevcli.model.temporal_model import build_model
 from bevcli.weights.model_file import model_file_for
 from bevcli.workshop.training.warm_start import warm_start
-
-sys.path.insert(0, str(Path(__file__).parent / "model"))
-
-from memory_drive import make_rig
-from small_model import small_model
 
 KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_text())
 

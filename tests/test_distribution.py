@@ -44,7 +44,7 @@ WITH_LOWEST = (
     "geometry/test_cameras.py",
     "model/test_deformable_attention.py",
     "inference/test_tracking.py",
-    "sequences/test_map_expansion.py",
+    "sequences/test_write_nuscenes.py",
     "recording/test_vehicle.py",
     "recording/test_write_mcap.py",
     "recording/test_video_images.py",

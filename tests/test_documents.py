@@ -1,15 +1,26 @@
-"""Every command, option and path that a document names exists. `make docs` checks the links."""
+"""Every command, option and path that a document names exists, and the examples run and are typed.
 
-from __future__ import annotations
+`make docs` checks the links.
+"""
 
+import contextlib
+import os
 import re
+import runpy
 import shlex
+import subprocess
+import sys
+from html.parser import HTMLParser
 from pathlib import Path
+from runpy import run_path
+from textwrap import dedent
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 import typer
 
+import bevcli
 from bevcli.cli.main import app
 
 ROOT = Path(__file__).parents[1]
@@ -109,3 +120,115 @@ def make_targets() -> set[str]:
 def test_make_targets_in_the_prose_exist(document: Path) -> None:
     mentioned = {span.split()[-1] for span in code_spans(document) if re.fullmatch(r"(\w+=\S+ )?make [\w-]+", span)}
     assert mentioned <= make_targets()
+
+
+DOCS = Path(__file__).parents[1] / "docs"
+page = runpy.run_path(str(DOCS / "site/commands_page.py"))["page"]
+
+
+def test_the_page_of_the_commands_is_current():
+    assert (DOCS / "commands.md").read_text() == page(), "run `python docs/site/commands_page.py > docs/commands.md`"
+
+
+def test_the_page_has_every_command_with_its_options():
+    text = page()
+    assert "\n## bevcli weights convert\n" in text
+    assert "| `--rate HZ\\|all` | Thin to this many frames per second. " in text
+    assert "| `--temporal`, `--no-temporal` | Use the frames before (and after). [--temporal] |" in text
+
+
+write_pages = run_path(str(ROOT / "docs/site/versions.py"))["write_pages"]
+
+
+def test_the_first_page_leads_to_the_newest_version(tmp_path):
+    for name in ("0.9.1", "0.10.0", "0.2.0", "doctrees"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "README.html").touch()
+    write_pages(tmp_path)
+    assert Links(tmp_path / "index.html").links == ["0.10.0/README.html"]
+    assert Links(tmp_path / "versions.html").links == [f"{name}/README.html" for name in ("0.10.0", "0.9.1", "0.2.0")]
+
+
+def test_reference_names_every_public_name():
+    named = re.findall(r"^- `bevcli\.(\w+)`: \S", (ROOT / "docs/reference.md").read_text(), flags=re.MULTILINE)
+    assert sorted(named) == sorted(set(named))
+    assert set(named) == set(bevcli.__all__)
+
+
+class Links(HTMLParser):
+    """Links and anchors of a page."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        self.anchors |= {given.get("id") or "", given.get("name") or ""}
+        link = given.get("href" if tag in ("a", "link") else "src")
+        if link and not re.match(r"\w+:|//", link):
+            self.links.append(unquote(link))
+
+
+PAGE = (ROOT / "docs" / "python.md").read_text()
+EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+
+
+def test_the_examples_run(tmp_path, capsys):
+    assert len(EXAMPLES) > 8
+    (tmp_path / "samples").symlink_to(ROOT / "samples")
+    with contextlib.chdir(tmp_path):
+        exec("\n".join(EXAMPLES), {})
+    assert "is missing (expected" in capsys.readouterr().out
+
+
+def test_every_public_name_can_be_imported():
+    for name in bevcli.__all__:
+        assert getattr(bevcli, name) is not None
+    assert set(bevcli.__all__) <= set(dir(bevcli))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        bevcli.no_such_name  # noqa: B018
+
+
+def test_importing_bevcli_loads_nothing_heavy():
+    heavy = ("torch", "numpy", "cv2", "rerun", "scipy", "numba")
+    code = f"import sys, bevcli; print([module for module in {heavy} if module in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+PYTHON_BLOCKS = re.compile(r"^```python\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)
+NAMED = re.compile(r"^ *`([\w./]+\.py)`:\n\n *```python\n(.*?)^ *```", flags=re.MULTILINE | re.DOTALL)
+# ROS 2, CARLA and ONNX Runtime have no types.
+SETTINGS = """[mypy]
+strict = true
+follow_imports = silent
+[mypy-rclpy.*,nav_msgs.*,sensor_msgs.*,vision_msgs.*,carla,onnxruntime]
+ignore_missing_imports = true
+[mypy-bevcli_node]
+disallow_subclassing_any = false
+"""
+
+
+def page_of(name: str) -> str:
+    return (ROOT / "docs" / name).read_text()
+
+
+@pytest.mark.slow
+def test_the_examples_pass_mypy_strict(tmp_path: Path) -> None:
+    pytest.importorskip("mypy")
+    files = {"python_page.py": "\n".join(PYTHON_BLOCKS.findall(page_of("python.md")))}
+    for document in ("live.md", "extend.md", "service.md"):
+        files |= {name: dedent(text) for name, text in NAMED.findall(page_of(document))}
+    assert {"cameras.py", "bevcli_node.py", "carla_client.py", "bevcli_ground/ground.py", "drawing.py"} < files.keys()
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    (tmp_path / "bevcli_ground/__init__.py").touch()
+    (tmp_path / "mypy.ini").write_text(SETTINGS)
+    checked = [name for name in files if "/" not in name] + ["bevcli_ground"]
+    command = [sys.executable, "-m", "mypy", "--config-file", "mypy.ini", *checked]
+    environment = os.environ | {"MYPYPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,7 +1,5 @@
 """The package of docs/extend.md, installed and run."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

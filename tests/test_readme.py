@@ -41,7 +41,7 @@ def test_the_commands_run(folder: Path) -> None:
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
-@pytest.mark.slow  # test_python_documentation.py runs the same calls
+@pytest.mark.slow  # test_documents.py runs the same calls
 def test_how_far_official_weights_are_tested_is_said_once() -> None:
     """The first claim on them links to it."""
     text = (ROOT / "README.md").read_text()

@@ -1,7 +1,5 @@
 """`run_python` without its imports, which take a second: each program is a fork of one process that has made them."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Model files for benchmarks that take seconds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import cache
 from importlib import resources

@@ -1,6 +1,4 @@
-"""`bevcli bench`: its output, and the numbers that are derived from others."""
-
-from __future__ import annotations
+"""`bevcli bench`: its output, its made-up drive and weights, and the number of operations."""
 
 import json
 import runpy
@@ -9,16 +7,19 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
+from bevcli.config import load_config
 from bevcli.inference.load import installed_engines
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.pillar_projection import find_hits, project_pillars
 from bevcli.workshop.benchmark import made_up, measure
-from bevcli.workshop.benchmark.made_up import MadeUpDrive
-from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits
+from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
+from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits, count_operations
 from bevcli.workshop.benchmark.versions import Comparison, Version
 
 
@@ -201,3 +202,84 @@ def test_runs_and_the_model_alone_take_turns_without_a_gap(window_model, monkeyp
     assert seen == [(place, None) for place in range(1, 17)]
     assert run_s > 0
     assert ratio > 0
+
+
+def test_the_cameras_see_about_as_many_cells_as_nuscenes():
+    config = load_config("tiny")
+    prepared = Preprocessor(config)(MadeUpDrive(1).load(0))
+    pillars = torch.as_tensor(config.bev_grid.pillars()).float().flatten(0, 1)
+    hits = find_hits(project_pillars(prepared.image_from_bev, pillars, (480, 800), prepared.has_image))
+    # 2812 in a real nuScenes frame, the first of the reference numbers.
+    assert 0.95 * 2812 < sum(hits.hits_per_camera) < 1.05 * 2812
+
+
+def test_images_are_decoded_and_differ():
+    frame = MadeUpDrive(2).load(1)
+    images = [image.pixels_bgr for image in frame.images.values()]
+    assert {image.shape for image in images} == {(900, 1600, 3)}
+    assert all(image.std() > 20 for image in images)
+    assert np.abs(images[0].astype(int) - images[1]).mean() > 20
+
+
+def test_no_matrix_is_zero_and_every_call_gives_the_same_weights(mini_config):
+    model, again = made_up_model(mini_config), made_up_model(mini_config)
+    assert all(parameter.any() for parameter in model.parameters() if parameter.ndim > 1)
+    state = again.state_dict()
+    assert all(torch.equal(tensor, state[name]) for name, tensor in model.state_dict().items())
+
+
+HITS = (400,) * 6
+RESNET50_OPERATIONS = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights
+
+
+@cache
+def operations_of_tiny() -> float:
+    return count_operations(load_config("tiny"), HITS)
+
+
+def test_tiny_needs_slightly_more_operations_than_six_resnet50():
+    backbone = 6 * RESNET50_OPERATIONS * (480 * 800) / 224**2
+    assert 1.02 * backbone < operations_of_tiny() < 1.12 * backbone
+
+
+@pytest.mark.slow
+def test_one_more_hit_adds_its_samples_in_every_layer():
+    config = load_config("tiny")
+    more = count_operations(config, (401, *HITS[1:])) - operations_of_tiny()
+    # 3 layers, 8 heads, 8 points, 32 channels; a product and a sum for four neighbours and for the weight.
+    assert more == 3 * 8 * 8 * 32 * (4 * 2 + 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["small", "base"])
+def test_larger_models_need_more_operations(name):
+    assert count_operations(load_config(name), HITS) > 4 * operations_of_tiny()
+
+
+@pytest.mark.slow
+def test_uniads_tracks_and_map_take_a_fifth_of_bases_operations():
+    base = count_operations(load_config("base"), HITS)
+    assert base < count_operations(load_config("uniad-track-map"), HITS) < 1.2 * base
+
+
+@pytest.mark.slow
+def test_vads_lines_futures_and_paths_are_counted():
+    """Smaller images than tiny's, and fewer than half as many operations in its own heads as in the backbone."""
+    config, motion = load_config("vad-tiny"), load_config("vad-tiny").motion
+    found = count_operations(config, HITS)
+    tokens, channels = config.decoder.queries * motion.modes, config.channels
+    own_attention = 2 * 2 * tokens * tokens * channels  # products of queries and keys, and of weights and values
+    backbone = 6 * RESNET50_OPERATIONS * (384 * 640) / 224**2
+    assert backbone + own_attention < found < 1.5 * backbone
+
+
+def test_the_segmentation_head_is_counted():
+    """Its products with every BEV cell: five projections, and two layers of attention and of masks."""
+    config = load_config("demo")
+    cells, channels, head = config.bev_grid.rows * config.bev_grid.columns, config.channels, config.segmentation
+    queries = head.thing_queries + 3
+    projections = (2 * head.mask_layers + head.location_layers) * 2 * cells * channels**2
+    masks = head.mask_layers * 3 * 2 * queries * cells * channels
+    without = count_operations(replace(config, heads=("detection",)), HITS)
+    added = count_operations(config, HITS) - without
+    assert projections + masks < added < 1.1 * (projections + masks)

@@ -1,7 +1,5 @@
 """`make gpu-check`: it needs a GPU, compares with the CPU, and reports what failed."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,5 +1,8 @@
-"""Residuals, levels and paths against points that are projected by hand."""
+"""Residuals, levels and paths against points projected by hand; cameras that see the same at once, or nothing."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -8,10 +11,12 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.adjustment import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
-from bevcli.workshop.calibration.road import level_corrections, sees_road
-from bevcli.workshop.calibration.views import View, Views, unknowns_of
+from bevcli.workshop.calibration.road import followed, level_corrections, sees_road
+from bevcli.workshop.calibration.views import PointMatches, View, Views, depths_of, unknowns_of
+from bevcli.workshop.correspondence.images import texture
+from bevcli.workshop.correspondence.points import FEWEST_AT_ONCE, Features, matched
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, RoadResiduals
-from bevcli.workshop.correspondence.road import beside_way
+from bevcli.workshop.correspondence.road import beside_way, points_of_road
 from bevcli.workshop.correspondence.solver import derivatives, geometry_at, solve, spread, values
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -196,3 +201,114 @@ def test_rays_are_the_inverse_of_the_projection(distortion):
     points = points[points[:, 2] > 3.5]
     pixels, _ = camera.project(points)
     assert np.allclose(camera.rays(pixels), points / 5, atol=1e-5)
+
+
+PAIRS, POINTS = 6, 80
+WRONG_DEG = np.array([0.1, 0.8, 1.0])  # pitch, yaw and roll of the right camera
+INTRINSICS = np.array([[577.0, 0, 500], [0, 577, 150], [0, 0, 1]])
+
+
+def vehicle(frame: int) -> np.ndarray:
+    """World_from_ego on a street that is nearly straight."""
+    return rigid((1.2 * frame, 0.01 * frame**2, 0), Rotation.from_euler("z", 0.6 * frame, degrees=True).as_matrix())
+
+
+def stereo() -> CameraRig:
+    """Two cameras of one rotation, half a metre apart."""
+    cameras = [
+        Camera(name, 1000, 300, INTRINSICS, rigid((1.1, y, 1.6), AHEAD)) for name, y in (("L", 0.0), ("R", -0.5))
+    ]
+    return CameraRig(tuple(cameras), default_ego_from_bev())
+
+
+def views_of(stated: CameraRig) -> Views:
+    tables = [np.stack([vehicle(frame)] * len(DELAYS_S)) for frame in range(PAIRS + 1)]
+    of = {(frame, camera): View(BLANK, BLANK, tables[frame]) for frame in range(PAIRS + 1) for camera in (0, 1)}
+    return Views(stated, stated, tuple((frame, frame + 1) for frame in range(PAIRS)), of)
+
+
+def matches_of(right: CameraRig, views: Views, noise_px: float) -> PointMatches:
+    """Points of a scene in all groups; a point has the same ray in all groups that begin with an image."""
+    generator, rays, groups = np.random.default_rng(0), [], []
+    for index, ((pair, first, second), moves) in enumerate(views.all_groups()):
+        start = pair * 1.2 + 1.1
+        spread = np.random.default_rng(pair).uniform((start + 6, -9, 0), (start + 60, 9, 5), (POINTS, 3))
+        sides = []
+        for frame, camera in ((pair, first), (pair + moves, second)):
+            pose = inverse(vehicle(frame) @ right.cameras[camera].ego_from_camera)
+            pixels, _ = right.cameras[camera].project(spread @ pose[:3, :3].T + pose[:3, 3])
+            same = np.random.default_rng((frame, camera)) if frame == pair and camera == first else generator
+            sides.append(right.cameras[camera].rays(pixels + same.normal(0, noise_px, pixels.shape)))
+        rays.append(sides)
+        groups.append(np.full(len(spread), index))
+    a, b = (np.concatenate([each[side] for each in rays]) for side in (0, 1))
+    group = np.concatenate(groups)
+    kinds = np.array([(g[1] == g[2], moves) for g, moves in views.all_groups()])[group]
+    return PointMatches(group, a, b, np.full(len(a), 577.0), kinds[:, 0], kinds[:, 1])
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Views of a rig that states a wrong rotation of its right camera, and matches with noise of the right one."""
+    right = stereo()
+    pose = right.cameras[1].ego_from_camera @ rigid(rotation=Rotation.from_rotvec(WRONG_DEG, degrees=True).as_matrix())
+    views = views_of(replace(right, cameras=(right.cameras[0], replace(right.cameras[1], ego_from_camera=pose))))
+    return views, unknowns_of(views, CalibrateOptions()), matches_of(right, views, 0.1)
+
+
+def test_neighbours_tell_their_rotation_against_each_other(planted):
+    _, unknowns, matches = planted
+    within, at_once, depths = matches.where(matches.same), matches.where(~matches.moves), depths_of(unknowns, matches)
+    x = np.zeros(len(unknowns.deviations))
+    for scale in (20.0, 5.0, 0.5):
+        x = solve(unknowns, [(within, scale), (at_once, scale), (depths, scale)], x).x
+    changes = np.degrees(unknowns.of_camera(x)[:, :3])
+    assert np.abs(changes[1] - changes[0] + WRONG_DEG).max() < 0.05
+
+
+def test_depths_of_two_cameras_fit_the_motion(planted):
+    right = views_of(stereo())
+    unknowns, exact = unknowns_of(right, CalibrateOptions()), matches_of(stereo(), right, 0.0)
+    depths, x = depths_of(unknowns, exact), np.zeros(len(unknowns.deviations))
+    assert len(depths.group) == PAIRS * POINTS
+    assert np.abs(values(unknowns, depths, x)).max() < 1e-3
+    x[OF_CAMERA + 1] = np.radians(0.1)  # the right camera, yaw: 1 px of disparity
+    assert 0.05 < np.median(np.linalg.norm(values(unknowns, depths, x), axis=-1)) < 1
+
+
+def test_few_matches_of_two_cameras_are_not_used():
+    left, right = stereo().cameras
+    points = np.random.default_rng(0).uniform((8, -6, -1), (30, 6, 4), (6 * FEWEST_AT_ONCE, 3))
+    descriptors = np.random.default_rng(1).integers(0, 100, (len(points), 128)).astype(np.float32)
+    seen = [Features(camera.project_ego(points)[0], descriptors) for camera in (left, right)]
+    assert len(matched(*seen, left, right, at_once=True)[0]) > FEWEST_AT_ONCE
+    few = [Features(each.pixels[: FEWEST_AT_ONCE - 5], each.descriptors[: FEWEST_AT_ONCE - 5]) for each in seen]
+    assert len(matched(*few, left, right, at_once=True)[0]) == 0
+
+
+def road_views(ground: np.ndarray, noise: float) -> Views:
+    """A camera that looks at a road in two frames. ground: grey, cells of 2 cm, a row along y; noise: of the images."""
+    camera = replace(stereo().cameras[0], height=500)
+    pixels = np.stack(np.meshgrid(np.arange(1000), np.arange(500)), axis=-1).reshape(-1, 2)
+    of = {}
+    for frame in (0, 1):
+        pose = vehicle(frame) @ camera.ego_from_camera
+        points = np.nan_to_num(points_of_road(pose, camera.rays(pixels)), nan=-99.0)
+        x, y = ((points[:, axis] + start) / 0.02 for axis, start in ((0, 0.0), (1, 12.0)))
+        grey = cv2.remap(ground, y.astype(np.float32).reshape(500, 1000), x.astype(np.float32).reshape(500, 1000), 1)
+        grey = grey + np.random.default_rng(frame).normal(0, noise, grey.shape)
+        table = np.stack([vehicle(frame)] * len(DELAYS_S))
+        of[frame, 0] = View(BLANK, texture(np.clip(grey, 0, 255).astype(np.uint8)), table)
+    rig = CameraRig((camera,), default_ego_from_bev())
+    return Views(rig, rig, ((0, 1),), of)
+
+
+@pytest.mark.parametrize(("striped", "least", "most"), [(False, 0.9, 1.1), (True, 0.0, 0.6)])
+def test_a_road_of_stripes_does_not_show_a_wrong_roll(striped, least, most):
+    size = (1 if striped else 200, 160)
+    ground = np.random.default_rng(0).uniform(-1, 1, size).astype(np.float32).repeat(200 // size[0], axis=0)
+    grey = 128 + 70 * cv2.resize(ground, (1200, 1500), interpolation=cv2.INTER_CUBIC)
+    views = road_views(grey, noise=4.0)
+    unknowns = unknowns_of(views, CalibrateOptions())
+    [share] = followed(views, unknowns, np.zeros(len(unknowns.deviations)), 12.0, np.zeros(1))
+    assert least < share < most

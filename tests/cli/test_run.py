@@ -1,4 +1,4 @@
-"""`bevcli run` as its user types it, with the mini model."""
+"""`bevcli run` and `bevcli batch` as their user types them, with the mini model."""
 
 import csv
 import json
@@ -11,13 +11,19 @@ import pytest
 import torch
 from command_line import MINI_TOML, command
 from memory_drive import MemoryDrive, WithoutImages
+from small_fleet import make_job, write_fleet
 
 from bevcli.cli.run import _run_notes
-from bevcli.errors import OutputError
+from bevcli.errors import BevcliError, OutputError
+from bevcli.frame import MAP_CLASSES
 from bevcli.inference.load import Model
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.sequences.files.map_folder import open_maps
+from bevcli.workshop.batch import Workers, worker
+from bevcli.workshop.batch.worker import run_on_ray
 
 SAMPLE = Path(__file__).parents[2] / "samples/street"
 
@@ -156,3 +162,68 @@ def test_the_note_on_rendered_streets_is_for_other_drives_only(mini_model):
     assert "`--model photographs` finds more" in notes
     drive.facts = replace(drive.facts, rendered=True)
     assert "trained on rendered streets" not in "\n".join(_run_notes(bundled, drive))
+
+
+def run(config, out, frames, *, force=False):
+    torch.manual_seed(0)
+    options = RunOptions(recording=RecordingOptions("minimal"))
+    run_into_folder(Model(BEVFormer(config).eval()), MemoryDrive(frames), out, options, force=force)
+
+
+def test_maps_are_written_and_an_earlier_runs_maps_are_gone(mini_config, tmp_path):
+    config = replace(mini_config, heads=("detection", "segmentation"))
+    run(config, tmp_path, frames=3)
+    run(config, tmp_path, frames=2, force=True)
+    maps = open_maps(tmp_path / "segmentation")
+    assert [maps.has(frame) for frame in range(3)] == [True, True, False]
+    assert maps.load(1).cells.shape == (48, 40)
+    assert (maps.x_range_m, maps.y_range_m, set(maps.classes)) == ((-25, 25), (-30, 30), set(MAP_CLASSES))
+
+
+def test_a_model_without_the_head_writes_no_maps(mini_config, tmp_path):
+    run(mini_config, tmp_path, frames=1)
+    assert not (tmp_path / "segmentation").exists()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("batch")
+    (folder / "mini.toml").write_text(MINI_TOML)
+    write_fleet(folder / "drives", 2, frames=1)
+    return folder
+
+
+def test_the_commands_end_with_what_they_wrote(place):
+    (place / "list.txt").write_text("drives/d001\ndrives/missing\n")
+    arguments = ("batch", "drives/d000", "--list", "list.txt", "--out", "out", "--model", "mini.toml", "--untrained")
+    done = command(place, *arguments, "--workers", "1", "--retries", "0")
+    assert done.returncode == 3, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0] == "drives   2 of 3 done, 1 failed"
+    assert [line.split()[-1] for line in lines if line.startswith("written")] == [
+        str(place / "out" / name) for name in ("batch.parquet", "batch.csv", "report.html")
+    ]
+    assert f"failed: missing: {place}/drives/missing: is missing" in done.stderr
+    assert "3/3 drives" in done.stderr
+
+
+def test_mistakes_are_one_line(place):
+    done = command(place, "batch", "drives/x*", "--out", "none", "--workers", "1")
+    assert (done.returncode, done.stderr) == (1, "error: drives/x*: nothing matches this pattern (expected drives)\n")
+    done = command(place, "batch", "drives/*", "--out", "none", "--model", "tiny", "--workers", "2")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: model tiny has no weights")
+    assert not (place / "none").exists()
+
+
+def test_a_cluster_needs_a_process_that_ran_no_local_batch(place, monkeypatch):
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: True)
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # what a batch on this machine leaves
+    with pytest.raises(BevcliError, match="use a new process for `address`"):
+        next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(address="10.0.0.1:6379")))
+
+
+def test_several_workers_without_ray_name_what_to_install(place, monkeypatch):
+    monkeypatch.setattr(worker, "ray_is_installed", lambda: False)
+    with pytest.raises(BevcliError, match=r"run pip install 'bevcli\[ray\]', or pass `count=1`"):
+        next(run_on_ray(make_job(place / "none", place / "mini.toml"), "hash", [], Workers(2)))

@@ -1,19 +1,14 @@
 """A small exported model and its copy in INT8, which the tests of engines share."""
 
-from __future__ import annotations
-
-import sys
 from pathlib import Path
 
 import pytest
+from small_model import model_for_engines, small_inputs
 
 from bevcli.config import as_table
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import export_onnx, quantize
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from small_model import model_for_engines, small_inputs
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """ONNX Runtime and OpenVINO in the place of PyTorch: the commands run an exported file, and INT8 stays close to it."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os
@@ -18,6 +16,7 @@ import pytest
 import torch
 from forks import FORKS
 from memory_drive import MemoryDrive, make_camera
+from small_model import check_file, model_for_engines, small_inputs, step_of_file
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -36,9 +35,6 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.exported import load_exported
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from small_model import check_file, model_for_engines, small_inputs, step_of_file
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

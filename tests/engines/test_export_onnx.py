@@ -1,7 +1,5 @@
 """An exported file computes what the model computes, from standard operators only."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -9,9 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import original_reference as original
 import pytest
 import torch
 from memory_drive import MemoryDrive, make_rig
+from small_model import check_file, model_for_engines, small_config, small_inputs, small_model, step_of_file
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, WeightsError
@@ -27,10 +27,6 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.engines.export_onnx import export_onnx, read_metadata
 from bevcli.workshop.engines.export_step import replace_parts
 from bevcli.workshop.engines.exported import check_exported, load_exported
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-import original_reference as original
-from small_model import check_file, model_for_engines, small_config, small_inputs, small_model, step_of_file
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

@@ -1,13 +1,11 @@
 """An exported BEVFormerV2 computes what the model computes, over whole drives: its window is that of the model."""
 
-from __future__ import annotations
-
 import json
-import sys
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
+import original_reference as original
 import pytest
 import torch
 from interrupted import run_frames
@@ -26,9 +24,6 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.exported import FrameDifference, check_exported
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-import original_reference as original
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

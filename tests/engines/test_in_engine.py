@@ -1,10 +1,7 @@
 """A model by its name in another engine: exported once, kept, made anew where the file is broken."""
 
-from __future__ import annotations
-
 import json
 import shutil
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from memory_drive import MemoryDrive, make_rig
+from small_model import model_for_engines
+from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
@@ -23,11 +23,6 @@ from bevcli.sequences.view import select_range
 from bevcli.workshop.engines import engine as module
 from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine, RoundingOpenVinoEngine
 from bevcli.workshop.engines.exported import load_exported
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from memory_drive import MemoryDrive, make_rig
-from small_model import model_for_engines
-from typer.testing import CliRunner
 
 pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")

@@ -1,12 +1,10 @@
 """A model on a detector as an exported file: features, boxes in images, hybrid queries, in float32 and INT8."""
 
-from __future__ import annotations
-
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from small_model import check_file, model_for_engines, small_inputs, step_of_file
 
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.nanodet import NanoDetConfig
@@ -14,9 +12,6 @@ from bevcli.registry import entries
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import export_onnx, quantize
 from bevcli.workshop.engines.exported import load_exported
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-from small_model import check_file, model_for_engines, small_inputs, step_of_file
 
 pytestmark = pytest.mark.slow  # exports a model of its own
 pytest.importorskip("onnx")

@@ -1,7 +1,5 @@
 """Random boxes to score, and predictions near them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Two models on the same frames: differences with intervals, the worst frames, and what both must have in common."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`bevcli eval` and `bevcli export` from the command line: files in, numbers, plots and one-line errors out."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

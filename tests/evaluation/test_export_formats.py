@@ -1,7 +1,5 @@
 """Exports contain the boxes of the file; KITTI labels are read back with the formulas of KITTI's development kit."""
 
-from __future__ import annotations
-
 import csv
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """A submission follows the rules that the nuScenes devkit checks when it reads one; they are restated here."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Damages a file or a folder as a full disk, a careless user or an attacker does."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cases of references that lead nowhere: tokens of nuScenes' tables, and numbers of a training's checkpoint."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cases of well-formed files that are wrong: ONNX graphs, meshes and siblings, batch records, SQLite schemas."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sqlite3

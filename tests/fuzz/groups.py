@@ -5,8 +5,6 @@ seeds, and does what a user's command would do. It fails by any exception but a 
 command succeeded with damaged output. The worker adds the limits on time and memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

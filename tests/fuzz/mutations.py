@@ -1,7 +1,5 @@
 """Breaks a file: changes of bytes, of words in a text, and of values in a JSON document."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -1,7 +1,5 @@
 """A valid, small file of every format that bevcli reads, from which the fuzz tests make broken ones."""
 
-from __future__ import annotations
-
 import collections
 import datetime
 import json

@@ -1,7 +1,5 @@
 """Cases of servers of weights that break off, lie, change their file and answer other questions than were asked."""
 
-from __future__ import annotations
-
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path

@@ -4,19 +4,12 @@ BEVCLI_FUZZ_CASES sets the number of cases of each reader (`make fuzz`). BEVCLI_
 broken files.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
-import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parents[1] / "sequences"))
-
 from mutations import edits, mutated
 from readers import READERS
 from seed_files import write_seeds

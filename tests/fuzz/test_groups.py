@@ -3,19 +3,11 @@
 BEVCLI_FUZZ_SHARE sets the share of the cases of each group (`make fuzz`: 1).
 """
 
-from __future__ import annotations
-
 import os
-import sys
 from math import ceil
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-sys.path.insert(0, str(Path(__file__).parents[1] / "sequences"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "model"))
-
 from groups import GROUPS
 from seed_files import write_seeds
 from worker import Worker

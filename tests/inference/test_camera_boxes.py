@@ -1,7 +1,5 @@
 """Boxes in the images of the cameras: back from the pixels of the network's input."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """BEVFormerV2 in a run: its window of image features, at scene starts, gaps and cuts, and with later frames."""
 
-from __future__ import annotations
-
 import gc
 from dataclasses import replace
 

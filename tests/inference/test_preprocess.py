@@ -1,3 +1,5 @@
+"""Images and projections of a frame for the network; resizing and normalising in one pass equals OpenCV's."""
+
 import gc
 import os
 import threading
@@ -9,12 +11,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings, strategies as st
 from memory_drive import MemoryDrive, WithoutImages, make_camera, make_rig
 
-from bevcli.geometry.cameras import CameraRig, Distortion
+from bevcli.errors import InputError
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
-from bevcli.inference.preprocess import Preprocessor, image_for_rig
-from bevcli.model.step import joined_inputs, model_inputs
+from bevcli.inference.preprocess import Preprocessor, image_for_rig, pixel_weights, resize_and_normalize
+from bevcli.model.step import assign_cameras, joined_inputs, model_inputs
 
 TASKS = Path("/proc/self/task")
 
@@ -224,3 +228,86 @@ def test_one_pool_of_threads_prepares_all_frames(mini_config, monkeypatch):
     while preprocessing_threads() & used and time.monotonic() < ended_by:
         time.sleep(0.01)
     assert not preprocessing_threads() & used
+
+
+INTERPOLATION = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
+MEAN, STD = np.array([103.5, 116.3, 123.7], np.float32), np.array([57.4, 57.1, 58.4], np.float32)
+lengths = st.integers(1, 90)
+
+
+def resized(pixels, width, height, method, **options):
+    out = np.full((3, height + 2, width + 3), -7, np.float32)
+    rows, columns = pixel_weights(len(pixels), height, method), pixel_weights(pixels.shape[1], width, method)
+    resize_and_normalize(pixels, rows, columns, MEAN, STD, out, **{"reverse_channels": False} | options)
+    assert (out[:, height:] == -7).all()  # the padding is left as it was
+    assert (out[:, :, width:] == -7).all()
+    return out[:, :height, :width]
+
+
+def by_opencv(pixels, width, height, method):
+    floats = cv2.resize(pixels.astype(np.float32), (width, height), interpolation=INTERPOLATION[method])
+    return ((floats - MEAN) / STD).transpose(2, 0, 1)
+
+
+@settings(max_examples=200, deadline=None)
+@given(lengths, lengths, lengths, lengths, st.sampled_from(sorted(INTERPOLATION)), st.integers(0, 2**31))
+def test_it_equals_opencv_for_any_size(width, height, new_width, new_height, method, seed):
+    if method == "area":  # only for shrinking
+        width, new_width = max(width, new_width), min(width, new_width)
+        height, new_height = max(height, new_height), min(height, new_height)
+    pixels = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    expected = by_opencv(pixels, new_width, new_height, method)
+    # OpenCV rounds positions in the image to float32.
+    np.testing.assert_allclose(resized(pixels, new_width, new_height, method), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("size", "method"), [((512, 288), "area"), ((800, 450), "linear"), ((1600, 900), "linear")])
+def test_it_equals_opencv_for_the_sizes_of_the_models(size, method):
+    pixels = np.random.default_rng(0).integers(0, 256, (900, 1600, 3), dtype=np.uint8)
+    np.testing.assert_allclose(resized(pixels, *size, method), by_opencv(pixels, *size, method), atol=5e-6)
+
+
+def test_channels_are_reversed_and_any_memory_layout_is_read():
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)[::2, 4:, ::-1]
+    reversed_pixels = np.ascontiguousarray(pixels[..., ::-1])
+    expected = by_opencv(reversed_pixels, 13, 7, "area")
+    np.testing.assert_allclose(resized(pixels, 13, 7, "area", reverse_channels=True), expected, atol=5e-6)
+
+
+def test_a_part_of_the_rows_and_columns_is_a_crop():
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    rows, columns = pixel_weights(40, 20, "linear", 5, 15), pixel_weights(60, 30, "linear", 8, 20)
+    out = np.zeros((3, 10, 12), np.float32)
+    resize_and_normalize(pixels, rows, columns, MEAN, STD, out, reverse_channels=False)
+    np.testing.assert_allclose(out, by_opencv(pixels, 30, 20, "linear")[:, 5:15, 8:20], atol=5e-6)
+
+
+MODEL = tuple(NUSCENES_YAWS_DEG)
+
+
+def test_known_names_take_the_models_order_not_the_rigs():
+    rig = make_rig(dict(reversed(NUSCENES_YAWS_DEG.items())))
+    assignment = assign_cameras(rig, MODEL)
+    assert assignment.cameras == assignment.embeddings == MODEL
+
+
+def test_unknown_names_go_by_viewing_direction():
+    rig = make_rig({"nose": 4.0, "tail": -176.0, "left": 80.0, "right": -92.0})
+    assignment = assign_cameras(rig, MODEL)
+    given = dict(zip(assignment.cameras, assignment.embeddings, strict=True))
+    assert given == {"nose": "CAM_FRONT", "tail": "CAM_BACK", "left": "CAM_FRONT_LEFT", "right": "CAM_BACK_RIGHT"}
+
+
+def test_a_seventh_camera_shares_an_embedding_after_its_owner():
+    assignment = assign_cameras(make_rig({**NUSCENES_YAWS_DEG, "extra": 2.0}), MODEL)
+    assert assignment.cameras[:2] == ("CAM_FRONT", "extra")
+    assert assignment.embeddings[:2] == ("CAM_FRONT", "CAM_FRONT")
+
+
+def test_the_users_choice_goes_first_and_is_checked():
+    rig = make_rig({"nose": 0.0})
+    assert assign_cameras(rig, MODEL, {"nose": "CAM_BACK"}).embeddings == ("CAM_BACK",)
+    with pytest.raises(InputError, match="tail"):
+        assign_cameras(rig, MODEL, {"tail": "CAM_BACK"})
+    with pytest.raises(InputError, match="CAM_TOP"):
+        assign_cameras(rig, MODEL, {"nose": "CAM_TOP"})

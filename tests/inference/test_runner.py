@@ -1,3 +1,6 @@
+"""The history of a run, its attention and stages; a frame whose numbers are not finite is told."""
+
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -6,11 +9,11 @@ import torch
 from memory_drive import MemoryDrive, WithoutImages, make_rig
 from stepping import CPU, run
 
-from bevcli.errors import InputError
+from bevcli.errors import InputError, WeightsError
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.geometry.transforms import apply
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.runner import Runner
+from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
@@ -150,3 +153,77 @@ def test_runners_leave_no_hooks_on_a_model(mini_model):
     with pytest.raises(RuntimeError):
         runner.step(None, replace(prepared, images=prepared.images[:, :, :1]))
     assert not any(module._forward_hooks or module._forward_pre_hooks for module in mini_model.modules())
+
+
+def predictions_of(model, frames=3):
+    steps = Runner(model, CPU).run(MemoryDrive(frames))
+    return [prediction for _, prediction, _ in steps]
+
+
+@pytest.mark.parametrize(
+    ("module", "where"),
+    [
+        ("backbone", "backbone"),
+        ("neck", "neck"),
+        ("encoder.layers.1.norms.0", "encoder layer 1 (encoder.layers.1.norms.0)"),
+        ("decoder.layers.1", "decoder layer 1"),
+    ],
+)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("prepared", [False, True], ids=["plain", "prepared"])
+def test_the_module_where_numbers_stop_being_finite_is_named(mini_model, module, where, value, prepared):
+    model = prepare_for_inference(mini_model, CPU) if prepared else mini_model
+
+    def spoil(module, arguments, output):
+        first = output[0] if isinstance(output, tuple | list) else output
+        first[0] = value
+
+    hook = model.get_submodule(module).register_forward_hook(spoil)
+    try:
+        found = predictions_of(model, frames=1)[0]
+    finally:
+        hook.remove()
+    assert where in found.not_finite
+    assert not len(found.boxes)
+    assert found.bev is None
+    assert not found.skipped
+
+
+def test_frames_after_a_failed_one_are_those_of_a_fresh_start(mini_model):
+    sequence, calls = MemoryDrive(4), []
+
+    def spoil_second(module, arguments, output):
+        calls.append(module)
+        if len(calls) in (2, 3):  # the second frame, and the search in it
+            output.fill_(float("nan"))
+
+    hook = mini_model.neck.output[0].register_forward_hook(spoil_second)
+    try:
+        predictions = predictions_of(mini_model, frames=4)
+    finally:
+        hook.remove()
+    assert [bool(p.not_finite) for p in predictions] == [False, True, False, False]
+    runner = Runner(mini_model, CPU)
+    fresh = [p for _, p, _ in runner.run(sequence, range(2, 4))]
+    for after, expected in zip(predictions[2:], fresh, strict=True):
+        assert torch.equal(after.bev, expected.bev)
+
+
+@pytest.mark.parametrize("prepared_model", [False, True], ids=["plain", "prepared"])
+def test_an_input_that_is_not_finite_is_named(mini_model, prepared_model):
+    model = prepare_for_inference(mini_model, CPU) if prepared_model else mini_model
+    runner, preprocessor, sequence = Runner(model, CPU), Preprocessor(mini_model.config), None
+    sequence = MemoryDrive(1)
+    prepared = preprocessor(sequence.load(0))
+    images = prepared.images.clone()
+    images[0, 0, 0, 0, 0] = float("nan")
+    state, prediction = runner.step(None, replace(prepared, images=images))
+    assert state == RunnerState()
+    assert prediction.not_finite == "input images"
+
+
+def test_a_batch_norm_of_negative_variance_is_refused_at_once(mini_model):
+    model = copy.deepcopy(mini_model)
+    model.backbone.bn1.running_var[3] = -1.0  # finite, but its root is not
+    with pytest.raises(WeightsError, match=r"backbone\.conv1\.weight: has NaN or infinity"):
+        prepare_for_inference(model, CPU)

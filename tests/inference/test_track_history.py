@@ -1,7 +1,5 @@
 """UniAD in a run: its BEV map and tracks go on from frame to frame, over cuts, gaps, scene changes and lost frames."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from itertools import pairwise
 

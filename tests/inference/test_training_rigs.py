@@ -1,7 +1,5 @@
 """A drive's rig is compared with the training of the weights, and its bev frame is levelled where they expect that."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 It prints one line for each case. The results and the gradients of the two versions have to be equal.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 from collections.abc import Callable, Sequence

@@ -6,8 +6,6 @@ golden_tiny.npz: outputs with weights and images by the rule of stated_rule.py; 
 codes and logits of every 9th query.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

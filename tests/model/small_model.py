@@ -1,7 +1,5 @@
 """A BEVFormer with some thousand weights, and random inputs for it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The reference numbers in tests/data were computed with the same rule: every tens
 seeded by the CRC-32 of its official key, and its scale depends on the kind of tensor.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import zlib

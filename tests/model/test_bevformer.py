@@ -1,7 +1,5 @@
 """The whole model: shapes, invariants, gradients, and that the BEV map is its only state."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Box codes to boxes, and back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A captured function, on a simulated device: replays give the function's results, and what cannot be captured runs."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 

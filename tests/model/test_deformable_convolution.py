@@ -1,7 +1,5 @@
 """Modulated deformable convolution equals a plain convolution and its definition as loops; the faster ones equal it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

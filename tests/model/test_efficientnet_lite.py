@@ -1,10 +1,12 @@
-"""EfficientNet-lite: sizes, strides, the original's numbers, the fast form, and frozen stages in a training."""
-
-from __future__ import annotations
+"""Backbones and neck: sizes, strides, the original's numbers, the fast form, frozen stages."""
 
 import copy
 import importlib.util
 import re
+import sys
+import types
+from dataclasses import fields
+from pathlib import Path
 
 import pytest
 import torch
@@ -13,12 +15,15 @@ from torch import nn
 
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError
+from bevcli.model import parts
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLite, EfficientNetLiteConfig
+from bevcli.model.fpn import FPN, FPNConfig
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.kernels.onednn import use_onednn
+from bevcli.model.kernels.onednn import PackedConvolution, has_onednn, use_onednn
+from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.resnet import ResNetConfig
+from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
 
 ALL_STAGES = (1, 2, 3, 4, 5, 6, 7)
 
@@ -139,3 +144,103 @@ def test_levels_have_the_sizes_of_the_maps() -> None:
     inputs = small_inputs(0)
     with torch.no_grad():
         assert model.image_features(inputs.images, inputs.camera_index).level_shapes == config.level_shapes
+
+
+@pytest.mark.parametrize("style", ["pytorch", "caffe"])
+def test_stages_halve_the_map_and_double_the_channels(style: str) -> None:
+    config = ResNetConfig((1, 1, 2, 1), style, (1, 2, 3, 4), deformable_stages=(3, 4), width=4)
+    maps = ResNet(config).eval()(torch.randn(2, 3, 64, 96))
+    assert [tuple(x.shape) for x in maps] == [(2, 16, 16, 24), (2, 32, 8, 12), (2, 64, 4, 6), (2, 128, 2, 3)]
+    assert config.output_channels() == (16, 32, 64, 128)
+
+
+@pytest.mark.parametrize(("style", "strided"), [("pytorch", "conv2"), ("caffe", "conv1")])
+def test_the_style_decides_which_convolution_has_the_stride(style: str, strided: str) -> None:
+    block = Bottleneck(16, 8, 2, style, deformable=False)
+    strides = {name: getattr(block, name).stride for name in ("conv1", "conv2")}
+    assert [name for name, stride in strides.items() if stride == (2, 2)] == [strided]
+
+
+def test_an_untrained_block_is_the_identity() -> None:
+    x = torch.rand(1, 32, 5, 5)
+    assert torch.equal(Bottleneck(32, 8, 1, "pytorch", deformable=False).eval()(x), x)
+
+
+def test_stages_after_the_last_output_stage_are_left_out() -> None:
+    config = ResNetConfig((1, 1, 1, 1), output_stages=(2,), width=4)
+    assert len(ResNet(config).stages) == 2
+
+
+def test_each_extra_level_halves_the_one_before() -> None:
+    neck = FPN((8, 16), 6, FPNConfig(levels=4))
+    maps = neck([torch.randn(1, 8, 10, 14), torch.randn(1, 16, 5, 7)])
+    assert [tuple(x.shape) for x in maps] == [(1, 6, 10, 14), (1, 6, 5, 7), (1, 6, 3, 4), (1, 6, 2, 2)]
+
+
+def test_context_flows_from_coarse_to_fine_only() -> None:
+    neck = FPN((4, 4), 4, FPNConfig(levels=2))
+    for convolution in neck.modules():
+        if isinstance(convolution, nn.Conv2d):
+            nn.init.dirac_(convolution.weight)
+    fine, coarse = torch.rand(1, 4, 4, 4), torch.rand(1, 4, 2, 2)
+    fine_out, coarse_out = neck([fine, coarse])
+    torch.testing.assert_close(coarse_out, coarse)
+    torch.testing.assert_close(fine_out, fine + coarse.repeat_interleave(2, -1).repeat_interleave(2, -2))
+
+
+PAGE = (Path(__file__).parents[2] / "docs/extend.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def page() -> types.ModuleType:
+    [code] = re.findall(r"^`bevcli_ground/backbone.py`:\n\n```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+    module = sys.modules["page"] = types.ModuleType("page")
+    exec(code, vars(module))
+    return module
+
+
+@pytest.fixture(scope="module")
+def model(page) -> Network:
+    torch.manual_seed(0)
+    settings = {field.name: getattr(small_config(), field.name) for field in fields(small_config())}
+    config = page.OwnBackboneBEVFormerConfig(**settings | {"backbone": page.OwnBackboneConfig()})
+    model = page.OwnBackboneBEVFormer(config).eval()
+    with torch.no_grad():
+        for module in model.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                for tensor in (module.weight, module.bias, module.running_mean):
+                    nn.init.normal_(tensor)
+                nn.init.uniform_(module.running_var, 0.5, 2)
+    return model
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.03)])
+def test_a_prepared_model_equals_the_plain_one(model, precision, tolerance):
+    inputs, prepared = small_inputs(), prepare_for_inference(model, torch.device("cpu"), precision)
+    with torch.inference_mode():
+        history = model(inputs).bev
+        for found, expected in zip(prepared.backbone(inputs.images[0]), model.backbone(inputs.images[0]), strict=True):
+            assert (found.float() - expected).norm() < tolerance * expected.norm()
+        found, expected = prepared(inputs, history), model(inputs, history)
+    assert (found.bev - expected.bev).norm() < tolerance * expected.bev.norm()
+    torch.testing.assert_close(found.box_codes, expected.box_codes, atol=10 * tolerance, rtol=10 * tolerance)
+
+
+def test_only_what_is_certain_is_folded_and_packed(model):
+    backbone = prepare_for_inference(model, torch.device("cpu")).backbone
+    stage = backbone.stages[1]
+    assert [type(part) for part in (backbone.norm, stage[2].norm)] == [type(model.backbone.norm), nn.BatchNorm2d]
+    assert isinstance(stage[1], nn.Identity)
+    assert type(stage[2].conv0) is nn.Conv2d  # padding by name, which oneDNN does not take
+    assert isinstance(stage[2].expand, PackedConvolution) == has_onednn(torch.float32)
+
+
+def test_its_stages_can_be_frozen_and_have_names(page, model, monkeypatch):
+    backbone = page.OwnBackboneConfig().build()
+    backbone.freeze(1)
+    learned = {name.split(".")[0] for name, parameter in backbone.named_parameters() if parameter.requires_grad}
+    assert learned == {"stages"}
+    assert not backbone.train().norm.training
+    monkeypatch.setattr(parts, "build_model", lambda config: page.OwnBackboneBEVFormer(config))
+    names = [part.name for part in parts.model_parts(model.config)]
+    assert names[:4] == ["backbone: stem", *(f"backbone: stage {stage}, stage {stage}" for stage in (1, 2, 3))]

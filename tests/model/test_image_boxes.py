@@ -1,16 +1,20 @@
-"""Boxes in the images: the decoding of a detector's maps, and the removal of doubles, against plain loops."""
-
-from __future__ import annotations
+"""Boxes in the images: the decoding of a detector's maps, the removal of doubles, the lift, and hybrid queries."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
+from small_model import HEIGHT, WIDTH, small_config, small_inputs
 from torch import Tensor
 
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
+from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.hybrid_queries import GROUPS, HybridQueriesConfig
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, best_image_boxes, without_doubles
+from bevcli.model.lift import NO_BOX, Lift, LiftConfig, hidden_feet
+from bevcli.model.nanodet import NanoDetConfig
 
 STRIDES, SIZES = (8, 16, 32), ((8, 12), (4, 6), (2, 3))  # of maps of an image of 96 x 64 pixels
 YES = torch.ones(1, 1, dtype=torch.bool)
@@ -128,3 +132,225 @@ def test_gradients_reach_the_features_and_the_boxes() -> None:
     (found.features.sum() + found.boxes.sum() + found.scores.sum()).backward()
     assert all(x.grad is not None and x.grad.isfinite().all() for x in (*maps, *predictions))
     assert sum(x.grad.abs().sum() for x in predictions) > 0
+
+
+COUNT = 20
+
+
+@pytest.fixture(scope="module")
+def model():
+    config, backbone = small_config(), NanoDetConfig(max_boxes=16)
+    hybrid = HybridQueriesConfig(COUNT, layers=1)
+    torch.manual_seed(1)  # some boxes are inside the grid
+    return BEVFormer(
+        replace(config, backbone=backbone, neck=replace(config.neck, levels=2), hybrid_queries=hybrid)
+    ).eval()
+
+
+def lifted(model, inputs):
+    """Class logits and codes of all boxes in the images, without the model's own layers; slopes."""
+    boxes = model.backbone.image_boxes(model.image_maps(inputs.images), inputs.has_image, inputs.image_sizes)
+    return model.hybrid_queries.lift(boxes, inputs.image_from_bev, inputs.image_sizes)
+
+
+@torch.no_grad()
+def test_without_training_they_are_the_lifted_boxes(model):
+    inputs = small_inputs()
+    outputs = model(inputs)
+    queries = model.config.decoder.queries
+    assert outputs.class_logits.shape[2] == outputs.box_codes.shape[2] == queries + COUNT
+    logits, codes, _ = lifted(model, inputs)
+    queries_of = {
+        tuple(code.tolist()): logit for code, logit in zip(codes[0], logits[0], strict=True) if logit.max() > NO_BOX
+    }
+    seen = outputs.class_logits[-1, 0, queries:].amax(-1) > NO_BOX
+    hybrid = outputs.box_codes[-1, 0, queries:][seen], outputs.class_logits[-1, 0, queries:][seen]
+    assert len(hybrid[0]) > 3
+    for code, logit in zip(*hybrid, strict=True):
+        assert torch.equal(queries_of[tuple(code.tolist())], logit)
+
+
+@torch.no_grad()
+def test_a_learned_query_loses_where_the_detector_looked_and_saw_nothing(model):
+    """Two cars that one camera sees, one of them in a box of a car; a cone, and a car that no camera sees."""
+    hybrid, classes = model.hybrid_queries, len(model.config.classes)
+    logits, codes = torch.zeros(1, 1, 3, classes), torch.zeros(1, 1, 3, 10)
+    codes[0, 0, :, :2] = torch.tensor([[0.0, 10.0], [5.0, 10.0], [20.0, 1.0]])
+    camera = torch.tensor([[WIDTH / 2, WIDTH / 2, 0, 0], [0, HEIGHT / 2, -HEIGHT, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+    middle = torch.tensor([WIDTH / 2, HEIGHT / 2] * 2)
+    box = middle + torch.tensor([-4.0, -4, 4, 4])
+    numbers = [box.view(1, 1, 1, 4), torch.full((1, 1, 1), 0.9), torch.full((1, 1, 1), IMAGE_CLASSES.index("car"))]
+    boxes = ImageBoxes(*numbers, *[torch.zeros(1, 1, 1, size) for size in (7, 128, 3)])
+    changed = hybrid.weighed(logits, codes, boxes, camera.view(1, 1, 4, 4), torch.tensor([[[WIDTH, HEIGHT]]]))[0, 0]
+    car = model.config.classes.index("car")
+    assert changed[:, car].tolist() == pytest.approx([0.0, -1.1, 0.0])
+    assert all(changed[:, i].abs().max() == 0 for i, name in enumerate(model.config.classes) if name not in GROUPS)
+
+
+@torch.no_grad()
+def test_nothing_comes_of_cameras_without_images_and_of_places_outside_the_grid(model):
+    inputs, queries = small_inputs(), model.config.decoder.queries
+    blind = replace(inputs, has_image=torch.zeros_like(inputs.has_image))
+    assert (model(blind).class_logits[:, :, queries:] == NO_BOX).all()
+    logits, codes, _ = lifted(model, inputs)
+    (x0, x1), (y0, y1) = model.config.bev_grid.x_range_m, model.config.bev_grid.y_range_m
+    x, y = codes[0, :, 0], codes[0, :, 1]
+    inside = ((x > x0) & (x < x1) & (y > y0) & (y < y1) & (logits[0].amax(-1) > NO_BOX)).sum()
+    found = model(inputs).class_logits[-1, 0, queries:].amax(-1) > NO_BOX
+    assert found.sum() == min(inside, COUNT)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("layers", [0, 1])
+def test_few_cameras_give_as_many_queries_some_of_them_empty(layers):
+    backbone, hybrid = NanoDetConfig(max_boxes=4), HybridQueriesConfig(COUNT, layers)
+    config = small_config()
+    neck = replace(config.neck, levels=2)
+    model = BEVFormer(replace(config, backbone=backbone, neck=neck, hybrid_queries=hybrid)).eval()
+    outputs = model(small_inputs())
+    logits, codes = (x[-1, 0, config.decoder.queries :] for x in (outputs.class_logits, outputs.box_codes))
+    assert len(logits) == len(codes) == COUNT
+    assert (logits[8:] == NO_BOX).all()
+    assert not codes[8:].any()
+
+
+def test_corrections_learn_from_the_bev_map(model):
+    """The lift stays as it is; all else of the hybrid queries has a gradient once the last layers are not zero."""
+    hybrid = model.hybrid_queries
+    torch.nn.init.normal_(hybrid.box_correction.weight)
+    torch.nn.init.normal_(hybrid.class_correction.weight)
+    outputs = model(small_inputs())
+    (outputs.box_codes[-1, :, -COUNT:].sum() + outputs.class_logits[-1, :, -COUNT:].sum()).backward()
+    without = {name.split(".")[0] for name, weight in hybrid.named_parameters() if weight.grad is None}
+    assert without == {"lift"}
+    torch.nn.init.zeros_(hybrid.box_correction.weight)
+    torch.nn.init.zeros_(hybrid.class_correction.weight)
+
+
+def test_they_need_a_detector():
+    with pytest.raises(ValueError, match="hybrid_queries needs a backbone that is a detector"):
+        replace(small_config(), hybrid_queries=HybridQueriesConfig(8))
+
+
+CLASSES = tuple(NUSCENES_CLASSES)
+GROUND_Z, CAMERA_M, FOCAL, SIZE = -1.84, 1.5, 500.0, (704.0, 396.0)
+
+
+def camera(yaw: float, pitch: float = 0.0) -> np.ndarray:
+    """(4, 4) image_from_bev of a camera at the origin, CAMERA_M above the ground, that looks along x turned by yaw."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    down = np.array([0, 0, -1.0])
+    ahead, right = np.array([c, s, 0]), np.array([s, -c, 0])
+    ahead, down = math.cos(pitch) * ahead + math.sin(pitch) * down, math.cos(pitch) * down - math.sin(pitch) * ahead
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]]) @ [right, down, ahead]
+    matrix[:3, 3] = -matrix[:3, :3] @ [0, 0, GROUND_Z + CAMERA_M]
+    return matrix
+
+
+def upright(
+    matrix: np.ndarray, distance: float, yaw: float, height: float, width: float, z: float = 0.0
+) -> list[float]:
+    """Box in the image of a flat upright object that stands `z` above the ground."""
+    ahead, side = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    points = [[*(distance * ahead + w * width / 2 * side), GROUND_Z + z + h, 1] for w in (-1, 1) for h in (0, height)]
+    projected = np.array(points) @ matrix.T
+    pixels = projected[:, :2] / projected[:, 2:3]
+    return [*pixels.min(0), *pixels.max(0)]
+
+
+def found(boxes: list[list[float]], name: str, score: float = 0.6) -> ImageBoxes:
+    """Boxes of one class in one image."""
+    logits = torch.full((1, 1, len(boxes), len(IMAGE_CLASSES)), -6.0)
+    logits[..., IMAGE_CLASSES.index(name)] = math.log(score / (1 - score))
+    shape = logits.shape[:3]
+    labels, features = logits.argmax(-1), torch.zeros(*shape, 128)
+    return ImageBoxes(
+        torch.tensor([[boxes]]).float(), torch.full(shape, score), labels, logits, features, torch.zeros(*shape, 3)
+    )
+
+
+def lifted_of(lift: Lift, boxes: ImageBoxes, *matrices: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    with torch.inference_mode():
+        return lift(boxes, torch.tensor(np.stack(matrices)).float()[None], torch.tensor([[SIZE] * len(matrices)]))
+
+
+@pytest.fixture(scope="module")
+def lift() -> Lift:
+    torch.manual_seed(0)
+    return Lift(LiftConfig(), CLASSES).eval()
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0, -2.5])
+def test_a_person_is_put_where_foot_and_height_say(lift: Lift, yaw: float) -> None:
+    box = upright(camera(yaw), 14, yaw + 0.2, 1.75, 0.6)
+    logits, codes, _ = lifted_of(lift, found([box], "person"), camera(yaw))
+    assert CLASSES[logits[0, 0].argmax()] == "pedestrian"
+    assert codes[0, 0, :2].numpy() == pytest.approx([14 * math.cos(yaw + 0.2), 14 * math.sin(yaw + 0.2)], abs=1.0)
+
+
+def test_all_boxes_tell_how_the_vehicle_pitches(lift: Lift) -> None:
+    ahead = [(9.0, -0.4), (13.0, 0.3), (18.0, 0.1), (25.0, -0.2)]
+    slopes = {}
+    for pitch_deg in (-1.0, 0.0, 1.0):
+        seen = camera(0.0, math.radians(pitch_deg))
+        boxes = found([upright(seen, d, yaw, 1.75, 0.6) for d, yaw in ahead], "person")
+        slopes[pitch_deg] = math.degrees(lifted_of(lift, boxes, camera(0.0))[2][0, 0])  # it is believed to be level
+    # A vehicle that looks down by a degree sees feet higher up: a ground that rises by a degree.
+    assert slopes[1.0] - slopes[0.0] == pytest.approx(1.0, abs=0.4)
+    assert slopes[-1.0] - slopes[0.0] == pytest.approx(-1.0, abs=0.4)
+
+
+def test_no_box_has_no_score_and_no_slope(lift: Lift) -> None:
+    boxes = found([upright(camera(0), 14, 0, 1.75, 0.6)], "person")
+    none = ImageBoxes(boxes.boxes, 0 * boxes.scores, boxes.labels, boxes.logits, boxes.features, boxes.cells)
+    logits, codes, slopes = lifted_of(lift, none, camera(0))
+    assert (logits == NO_BOX).all()
+    assert codes.isfinite().all()
+    assert (slopes == 0).all()
+
+
+def test_a_box_of_a_second_class_does_not_count(lift: Lift) -> None:
+    boxes = found([upright(camera(0), 14, 0, 1.75, 0.6)] * 2, "person")
+    boxes.labels[0, 0, 1] = IMAGE_CLASSES.index("car")
+    logits, _, _ = lifted_of(lift, boxes, camera(0))
+    assert logits[0, 0].max() > 0
+    assert logits[0, 1].max() == NO_BOX
+
+
+def test_frames_of_a_batch_do_not_change_each_other(lift: Lift) -> None:
+    first = found([upright(camera(0.5), d, 0.4, 1.75, 0.6) for d in (9, 20)], "person")
+    second = found([upright(camera(0.5), d, 0.7, 1.6, 1.8) for d in (7, 12)], "car", 0.3)
+    both = ImageBoxes(*(torch.cat([getattr(x, name) for x in (first, second)]) for name in vars(first)))
+    matrices = torch.tensor(camera(0.5)).float()[None, None].repeat(2, 1, 1, 1)
+    with torch.inference_mode():
+        together = lift(both, matrices, torch.tensor([[SIZE]] * 2))
+    for index, boxes in enumerate((first, second)):
+        for a, b in zip(together, lifted_of(lift, boxes, camera(0.5)), strict=True):
+            torch.testing.assert_close(a[index], b[0])
+
+
+def test_a_nearer_box_hides_a_foot() -> None:
+    boxes = torch.tensor([[[[10.0, 10, 30, 50], [20.0, 20, 60, 80]]]])
+    hidden = hidden_feet(boxes, torch.ones(1, 1, 2))[0, 0]
+    assert hidden[0] == pytest.approx(0.5 * (1 - 300 / (800 + 2400 - 300)))
+    assert hidden[1] == 0
+
+
+@pytest.mark.slow
+def test_the_lift_is_exported(lift: Lift) -> None:
+    boxes = found([upright(camera(0), 14, 0, 1.75, 0.6)] * 3, "person")
+
+    class Exported(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.lift = lift
+
+        def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+            *parts, matrices, sizes = inputs
+            return tuple(self.lift(ImageBoxes(*parts), matrices, sizes))
+
+    inputs = (*vars(boxes).values(), torch.tensor(camera(0)).float()[None, None], torch.tensor([[SIZE]]))
+    program = torch.export.export(Exported(), inputs)
+    for a, b in zip(program.module()(*inputs), Exported()(*inputs), strict=True):
+        torch.testing.assert_close(a, b)

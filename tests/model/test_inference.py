@@ -1,7 +1,5 @@
 """A prepared model equals the model itself."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

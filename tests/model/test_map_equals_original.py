@@ -5,8 +5,6 @@ golden_uniad_map.npz in tests/data holds a part of the original's numbers for on
 the folder golden/ of BEVCLI_SHARED.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple

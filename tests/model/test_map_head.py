@@ -1,7 +1,5 @@
 """The map head: its attention as the released code's kernel reads it, its shapes, and the rules of its map."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

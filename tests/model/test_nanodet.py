@@ -1,7 +1,5 @@
 """NanoDet-g: the network, the weights of the package, frozen in a training, the fast forms, and boxes in the images."""
 
-from __future__ import annotations
-
 import copy
 import random
 

@@ -1,7 +1,5 @@
 """oneDNN's layers compute the same as PyTorch's."""
 
-from __future__ import annotations
-
 import copy
 import threading
 

@@ -1,7 +1,5 @@
 """Pillars in the cameras, compared with OpenCV's projection; the list of hits, also padded and by a compiled loop."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import original_reference as original

@@ -1,7 +1,5 @@
 """The prepared tiny model on the four reference frames, with weights by the rule of stated_rule.py."""
 
-from __future__ import annotations
-
 import numpy as np
 import original_reference as original
 import pytest

@@ -1,7 +1,5 @@
 """The segmentation head: shapes, its parts, and the rules by which masks become a map."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

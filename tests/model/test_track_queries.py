@@ -1,7 +1,5 @@
 """UniAD's tracks: births, misses and deaths, expected places, the memory bank, and boxes with identities."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

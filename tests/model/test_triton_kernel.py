@@ -1,8 +1,6 @@
 """The Triton kernels, without a GPU: they compile for every generation of cards, and in Triton's interpreter they equal
 the plain versions."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -5,8 +5,6 @@ births, misses, deaths, full memories and a scene change. The full numbers, and 
 frames, are in the folder golden/ of BEVCLI_SHARED.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ cell, logits and codes of every 9th query and the boxes; projections and visible
 (_1: one frame, _2: two frames). The full numbers are in the folder golden/ of BEVCLI_SHARED.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

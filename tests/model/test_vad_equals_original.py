@@ -4,8 +4,6 @@ golden_vad.npz in tests/data holds a part of the original's numbers for the firs
 are in the folder golden/ of BEVCLI_SHARED.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator, Mapping

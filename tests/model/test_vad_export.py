@@ -1,7 +1,5 @@
 """The exported form of a VAD: ONNX Runtime computes what the model computes, over frames with history."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """UniAD with weights by the rule of uniad_rule.py, and the poses of the sequence for its tracker alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

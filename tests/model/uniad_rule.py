@@ -4,8 +4,6 @@ golden_keys_uniad.json in tests/data: the keys and shapes of the official weight
 the same shape, and under "unused" those without effect at inference.
 """
 
-from __future__ import annotations
-
 import json
 import re
 

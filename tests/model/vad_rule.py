@@ -4,8 +4,6 @@ golden_keys_vad.json in tests/data: the keys and shapes of the official weights 
 the same shape, and those of tiny that VAD does not have.
 """
 
-from __future__ import annotations
-
 import json
 import re
 

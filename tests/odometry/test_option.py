@@ -1,8 +1,9 @@
-"""The option `odometry`: opening a drive, runs, conversions, and messages of drives without poses.
+"""The option and the command `odometry`: opening a drive, runs, conversions, and messages of drives without poses.
 
 The measurement is replaced by the true motion; tests of the measurement itself are in test_measure.py.
 """
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 
@@ -20,7 +21,7 @@ from bevcli.sequences.open import open_steps
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.batch.job import Job
-from bevcli.workshop.odometry import drives
+from bevcli.workshop.odometry import drives, measure
 from bevcli.workshop.odometry.drives import MOST_RATE_HZ, at_most_rate, with_measured_motion
 from bevcli.workshop.scores.inputs import pair_frames
 
@@ -179,3 +180,54 @@ def test_boxes_are_scored_in_the_world_of_the_ground_truth():
     pairs = pair_frames(predicted, BoxesFile("world", tuple(truth)))
     for found, true in zip(*pairs.boxes, strict=True):
         assert found.centers == pytest.approx(true.centers, abs=1e-6)
+
+
+COMMAND_FRAMES = 5
+
+
+@pytest.fixture
+def measured_truly(monkeypatch):
+    """A measurement that loads the frames of a drive, and gives the true motion."""
+    true = motion_of(bevcli.open_sequence(STREET, frames=slice(0, COMMAND_FRAMES), ground_truth=False), guessed=(1,))
+
+    def measured(drive, options=None):
+        for index in range(len(drive.stamps)):
+            drive.load(index)
+        yield from true.steps
+
+    monkeypatch.setattr(measure, "measure_steps", measured)
+
+
+def test_a_drive_without_poses_gets_four_files_and_a_table(tmp_path, measured_truly):
+    folder = street_copy(tmp_path / "drive", COMMAND_FRAMES)
+    done = command(tmp_path, "odometry", str(folder))
+    assert done.returncode == 0, done.stderr
+    assert "4/4 steps" in done.stderr
+    assert "m in 2.0 s, 4 steps" in done.stdout
+    assert "not measured  1 step (too dark)" in done.stdout
+    assert "stated poses" not in done.stdout
+    out = tmp_path / "runs/drive-odometry"
+    names = {"ego_motion.csv", "report.json", "odometry.png", "odometry.rrd"}
+    assert {path.name for path in out.iterdir()} == names
+    assert all(f"runs/drive-odometry/{name}" in done.stdout for name in names)
+    assert bevcli.open_sequence(folder, ego_motion_file=out / "ego_motion.csv").has_ego_motion
+
+
+def test_the_mistake_of_stated_poses_is_named(tmp_path, measured_truly):
+    folder = street_copy(tmp_path / "drive", COMMAND_FRAMES)
+    rows = [line.split(",") for line in (STREET / "ego_motion.csv").read_text().splitlines()]
+    wrong = [[row[0], *(str(1000 * float(cell)) for cell in row[1:4]), *row[4:8]] for row in rows[1:]]
+    (folder / "ego_motion.csv").write_text("\n".join(",".join(row) for row in [rows[0][:8], *wrong]))
+    done = command(tmp_path, "odometry", str(folder), "--out", "out", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["stated"]["end_m"] > 1000
+    assert ["millimetres" in finding["message"] for finding in report["stated"]["findings"]] == [True]
+    assert report["not_measured"] == {"too dark": 1}
+    assert report == json.loads((tmp_path / "out/report.json").read_text())
+
+
+def test_the_drive_itself_is_no_output(tmp_path):
+    done = command(tmp_path, "odometry", str(STREET), "--out", str(STREET))
+    assert done.returncode == 1
+    assert "ego_motion.csv: is the input" in done.stderr

@@ -1,5 +1,6 @@
-"""The motion of a vehicle through a drawn street: a road and two walls with a random texture, seen by two cameras."""
+"""The motion of a vehicle through a drawn street with a random texture, seen by two cameras; votes on it."""
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -12,11 +13,13 @@ from bevcli.frame import CameraImage, Frame, FrameStamp
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid, rotation_about_z
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
 from bevcli.workshop.odometry.flow import road_flow
-from bevcli.workshop.odometry.measure import MeasuredStep, MotionMeter
+from bevcli.workshop.odometry.measure import Chain, MeasuredStep, MotionMeter, leaps
 from bevcli.workshop.odometry.step_views import motion_of, next_slopes
+from bevcli.workshop.odometry.steps import Candidate
 from bevcli.workshop.odometry.views import CELL_M, SHAPE, RoadPicture
-from bevcli.workshop.odometry.votes import distance_votes
+from bevcli.workshop.odometry.votes import CHANCE, distance_votes, point_votes, stands, under_the_road, ways_of_points
 
 TEXEL_M = 0.06
 WALLS_M = 7.0  # to both sides
@@ -120,3 +123,139 @@ def test_a_vehicle_that_drives_along_a_slope_stays_on_it() -> None:
     for ahead in ((0.0, 0.0), (5.0, 1.0)):  # points of the road in the second ego frame lie on it in the first one
         x, y, z, _ = motion @ [*ahead, slopes @ ahead, 1]
         assert z == pytest.approx(0.03 * x - 0.01 * y)
+
+
+def driven(distance: float, votes: float, yaw: float = 0.0) -> Candidate:
+    """A motion along x."""
+    return Candidate(np.array([0, 0, yaw, distance, 0, 0, 0, 0]), np.eye(6), votes, 0, 0)
+
+
+def chosen(steps: list[list[Candidate]], seconds: float = 0.5) -> list[float]:
+    """The distances that the chain decides."""
+    chain = Chain()
+    decided = [chain.add(step, seconds) for step in steps] + [chain.end()]
+    return [float(each.state[3]) for each in decided if each is not None]
+
+
+def test_the_neighbours_decide_where_votes_are_about_equal() -> None:
+    right, wrong = driven(4.0, 4.0), driven(1.0, 4.1)
+    assert chosen([[driven(4.1, 5.0)], [wrong, right], [driven(3.9, 5.0)]]) == [4.1, 4.0, 3.9]
+    assert chosen([[wrong, right], [driven(4.0, 5.0)]]) == [4.0, 4.0]  # the next step decides about the first
+    assert chosen([[driven(4.0, 5.0)], [wrong, right]]) == [4.0, 4.0]
+
+
+def test_many_votes_outweigh_a_change_of_speed() -> None:
+    assert chosen([[driven(4.0, 5.0)], [driven(3.0, 9.0), driven(4.0, 2.0)]]) == [4.0, 3.0]
+
+
+def test_backwards_is_not_the_same_speed() -> None:
+    assert chosen([[driven(-2.0, 5.0)], [driven(2.0, 4.1), driven(-2.0, 4.0)]]) == [-2.0, -2.0]
+
+
+def test_a_leap_with_few_points_of_the_road_is_not_believed() -> None:
+    before, short, after = driven(4.0, 1.0), driven(0.9, 1.0), driven(4.2, 1.0)
+    times = 0.5, 0.5, 0.5
+    assert leaps(before, short, after, times)
+    assert not leaps(before, replace(short, road_points=400), after, times)
+    assert not leaps(before, short, driven(0.2, 1.0), times)  # it brakes
+    assert not leaps(before, driven(3.5, 1.0), after, times)
+
+
+def test_a_step_is_decided_one_step_later() -> None:
+    chain = Chain()
+    first, second = driven(1.0, 1.0), driven(1.1, 1.0)
+    assert chain.add([first], 0.5) is None
+    assert chain.likeliest is first
+    assert chain.add([second], 0.5) is first
+    assert chain.end() is second
+    assert chain.end() is None
+
+
+HEIGHT_M, FOCAL = 1.5, 1000.0
+FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, HEIGHT_M], [0, 0, 0, 1]])  # ego_from_camera
+DISTANCES = np.arange(-1.0, 8.0, 0.08)
+
+
+def matches(points: Array, moved: Array) -> EpipolarResiduals:
+    """Points (n, 3) of the ego frame that the second image shows nearer by `moved` (n,), along x."""
+    later = points - np.column_stack([moved, np.zeros((len(points), 2))])
+    rays = [(each - FORWARD[:3, 3]) @ FORWARD[:3, :3] for each in (points, later)]
+    a, b = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in rays)
+    return EpipolarResiduals(np.zeros(len(points), dtype=np.int64), a, b, np.full(len(points), FOCAL))
+
+
+def ways(points: Array, moved: Array, assumed_m: float = 4.0) -> Array:
+    """The ways of `matches`."""
+    geometry = GroupGeometry(FORWARD[None], FORWARD[None], rigid((-assumed_m, 0, 0))[None], np.zeros(2))
+    return ways_of_points(matches(points, moved), geometry, assumed_m)
+
+
+def street(count: int, highest_m: float) -> Array:
+    """Points of the road, or of what stands on it."""
+    random = np.random.default_rng(count)
+    return random.uniform((8, -6, 0), (25, 6, highest_m), (count, 3))
+
+
+def most_voted(found: Array) -> float:
+    """The distance with the most votes."""
+    return float(DISTANCES[int(np.argmax(point_votes(found, DISTANCES) * (DISTANCES > 0)))])
+
+
+@pytest.mark.parametrize("moved_m", [0.4, 3.0])
+def test_points_of_the_road_tell_the_way(moved_m: float) -> None:
+    found = ways(street(40, 0.0), np.full(40, moved_m))
+    np.testing.assert_allclose(found[np.isfinite(found)], moved_m, rtol=1e-6)
+    assert most_voted(found) == pytest.approx(moved_m, abs=0.05)
+
+
+def test_higher_points_and_vehicles_do_not_outvote_the_road() -> None:
+    points = np.concatenate([street(30, 0.0), street(30, 1.2), street(20, 1.0)])
+    moved = np.concatenate([np.full(60, 3.0), np.full(20, 0.3)])  # the last ones drive ahead, a little slower
+    assert most_voted(ways(points, moved)) == pytest.approx(3.0, rel=0.05)
+
+
+def test_vehicles_ahead_would_lie_under_the_road() -> None:
+    points = np.concatenate([street(30, 0.0), street(30, 1.2), street(20, 1.0)])
+    found = under_the_road(ways(points, np.concatenate([np.full(60, 3.0), np.full(20, 0.5)])))
+    assert not found[:60].any()
+    assert found[60:].mean() > 0.8
+
+
+def test_points_that_stay_tell_nothing() -> None:
+    points = np.concatenate([street(30, 0.0), street(60, 0.0)])
+    found = ways(points, np.concatenate([np.full(30, 3.0), np.zeros(60)]))  # such as drops on the lens
+    assert np.isfinite(found).sum() == 30
+    assert most_voted(found) == pytest.approx(3.0, abs=0.05)
+    assert point_votes(found, np.zeros(1)) == pytest.approx(CHANCE)  # "stands" gets the least votes
+
+
+def test_few_points_do_not_vote() -> None:
+    np.testing.assert_array_equal(point_votes(np.full(5, 3.0), DISTANCES), 1.0)
+
+
+def stays(points: Array, moved_m: Array) -> bool:
+    """The answer of `stands` for `matches`."""
+    return stands(matches(points, moved_m), np.broadcast_to(FORWARD, (len(points), 4, 4)))
+
+
+def before_houses(far: int, road: int) -> Array:
+    """Houses far away, and points of the road near the vehicle."""
+    random = np.random.default_rng(1)
+    houses = random.uniform((60, -40, 2), (150, 40, 12), (far, 3))
+    return np.concatenate([houses, random.uniform((5, -4, 0), (12, 4, 0), (road, 3))])
+
+
+def test_a_vehicle_stands_although_one_car_moves() -> None:
+    points = before_houses(80, 20)
+    moved = np.where(np.arange(100) >= 92, 2.0, 0.0)  # 8 of the 20 near points
+    assert stays(points, moved)
+    assert not stays(points, np.full(100, 2.0))
+
+
+def test_a_creeping_vehicle_does_not_stand() -> None:
+    assert not stays(before_houses(180, 20), np.full(200, 0.07))  # 90 % of the points stay, but not those of the road
+    assert stays(before_houses(180, 20), np.full(200, 0.001))
+
+
+def test_few_points_do_not_tell_that_a_vehicle_stands() -> None:
+    assert not stays(before_houses(20, 0), np.zeros(20))

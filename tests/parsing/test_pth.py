@@ -1,7 +1,5 @@
 """PyTorch files: tensors and plain values are read, everything else is left out, and nothing in the file runs."""
 
-from __future__ import annotations
-
 import collections
 import datetime
 import io

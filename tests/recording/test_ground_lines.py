@@ -1,7 +1,5 @@
 """Lines of the map, futures and planned paths in a recording: in the scene, from above and in the images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

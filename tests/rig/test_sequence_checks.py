@@ -1,12 +1,30 @@
-"""Ego-motion with the common mistakes, and timestamps of images: each mistake is found, and nothing else."""
+"""Mistakes of ego motion, image times and coverage are found and nothing else; the checks before a run; their codes."""
+
+import ast
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import MINI_TOML, command
+from healthy_rigs import camera, copy_of, rig
 from mistakes import MOTION_MISTAKES, drive, motion_of
+from stated_mistakes import MISTAKES
 
-from bevcli.rig.check_calibration import check_camera_times
-from bevcli.rig.sequence_checks import check_ego_motion
+import bevcli
+from bevcli.findings import errors_of
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.rig.check_calibration import check_calibration, check_camera_times
+from bevcli.rig.coverage import coverage_of
+from bevcli.rig.drawings import horizon
+from bevcli.rig.rig_checks import mounting_of, seen_fov_deg
+from bevcli.rig.sequence_checks import check_ego_motion, input_errors
+from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
+from bevcli.sequences.open import open_sequence
 
 
 @pytest.mark.parametrize("start_yaw", [0.0, 0.7, 2.0, -3.0])
@@ -85,3 +103,148 @@ def test_velocities_from_uneven_poses_are_not_blamed(tmp_path):
     assert "ego-speed" not in [finding.code for finding in check_ego_motion(motion)]
     path.write_text("\n".join([lines[0] + ",vx,vy,vz", *(line + ",1,0,0" for line in lines[1:])]) + "\n")
     assert "ego-speed" in [finding.code for finding in check_ego_motion(read_ego_motion(path))]
+
+
+PACKAGE = Path(bevcli.__file__).parent
+DOCUMENT = PACKAGE.parent / "docs" / "calibration.md"
+CODE = r"[a-z]+(?:-[a-z]+)+"
+DOCUMENTED = set(re.findall(f"`({CODE})`", DOCUMENT.read_text())) - {"project-debug"}
+# docs/trust.md has those of faults in images.
+FILES = [path for path in PACKAGE.rglob("*.py") if "trust" not in path.parts]
+SOURCES = [ast.parse(text) for text in (path.read_text() for path in FILES) if "Finding" in text]
+NODES = [node for source in SOURCES for node in ast.walk(source)]
+
+
+def test_every_finding_is_documented():
+    calls = [node for node in NODES if isinstance(node, ast.Call) and ast.unparse(node.func) == "Finding"]
+    codes = {call.args[0].value for call in calls if call.args and isinstance(call.args[0], ast.Constant)}
+    assert len(codes) > 20
+    assert sorted(codes - DOCUMENTED) == []
+
+
+def test_every_documented_finding_is_in_the_code():
+    texts = {node.value for node in NODES if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    of_motion = {code for _, code, *_ in MISTAKES.values()}  # made of their parts
+    assert sorted(DOCUMENTED - texts - of_motion) == []
+
+
+def test_the_images_are_there():
+    for image in re.findall(r"\]\((images/[^)]+)\)", DOCUMENT.read_text()):
+        assert (DOCUMENT.parent / image).stat().st_size > 10_000
+
+
+def rig_of(document, folder):
+    (folder / "calibration.json").write_text(json.dumps(document))
+    return read_calibration(folder / "calibration.json")
+
+
+def test_one_level_camera_sees_its_quadrant(tmp_path):
+    """90° across at the bev frame's origin: far from the camera it sees |x| < y, and pillars as high as the camera."""
+    document = rig({"front": camera((0.94, 0.0, 1.84), 0, 800.0)})
+    document["cameras"]["front"]["intrinsics"][0][2] = 800.0
+    grid = BevGrid(rows=40, columns=42)  # no cell lies on the diagonal
+    coverage = coverage_of(rig_of(document, tmp_path), grid)
+    x, y = np.moveaxis(grid.cell_centers(), -1, 0)
+    far = y > 12  # nearer, the highest and lowest points leave the image, yet some of each pillar stays in it
+    np.testing.assert_array_equal(coverage.counts[far], (np.abs(x) < y)[far].astype(int))
+    assert (coverage.counts[y < 0] == 0).all()
+    assert coverage.shares["front"] == coverage.counts.mean() == 1 - coverage.unseen
+
+
+def test_two_equal_cameras_see_each_cell_twice(tmp_path):
+    one = camera((0.94, 0.0, 1.84), 0, 800.0)
+    coverage = coverage_of(rig_of(rig({"a": one, "b": one}), tmp_path))
+    assert set(np.unique(coverage.counts)) == {0, 2}
+    assert coverage.overlap == coverage.shares["a"]
+
+
+@pytest.mark.parametrize(
+    ("yaw", "pitch", "roll"), [(0, 0, 0), (55, 3, -4), (-110, -20, 8), (180, 10, 0), (90, -45, 20), (0, 30, 180)]
+)
+def test_the_mounting_has_the_angles_the_camera_was_turned_by(yaw, pitch, roll, tmp_path):
+    document = rig({"any": camera((1.0, 0.5, 1.6), yaw, 900.0, pitch=pitch, roll=roll)})
+    mounting = mounting_of(rig_of(document, tmp_path)["any"].ego_from_camera)
+    found = np.exp(1j * np.radians([mounting.yaw_deg, mounting.pitch_deg, mounting.roll_deg]))
+    np.testing.assert_allclose(found, np.exp(1j * np.radians([yaw, pitch, roll])), atol=1e-12)
+    assert mounting.height == 1.6
+
+
+def test_the_field_of_view_of_a_pinhole(tmp_path):
+    for focal, degrees in ((800.0, 90.0), (800.0 / np.tan(np.radians(15)), 30.0)):
+        document = rig({"any": camera((0, 0, 1.6), 0, focal)})
+        document["cameras"]["any"]["intrinsics"][0][2] = 800.0
+        assert seen_fov_deg(rig_of(document, tmp_path)["any"])[0] == pytest.approx(degrees, abs=0.2)
+
+
+def test_a_level_cameras_horizon_is_its_principal_points_row(tmp_path):
+    level = rig_of(rig({"any": camera((0, 0, 1.6), 30, 900.0)}), tmp_path)["any"]
+    rows = horizon(level)[:, 1]
+    np.testing.assert_allclose(rows[np.isfinite(rows)], level.intrinsics[1, 2], atol=1e-6)
+    up = rig_of(rig({"any": camera((0, 0, 1.6), 30, 900.0, pitch=5)}), tmp_path)["any"]
+    lowest = np.nanmin(horizon(up)[:, 1])  # of a camera that looks up the horizon lies below the middle
+    assert lowest == pytest.approx(up.intrinsics[1, 2] + 900 * np.tan(np.radians(5)), abs=1e-3)
+
+
+def test_every_healthy_rig_is_seen_by_its_cameras(tmp_path):
+    for name in ("six", "four fisheyes", "seven"):
+        coverage = coverage_of(rig_of(copy_of(name), tmp_path))
+        assert all(share > 0.03 for share in coverage.shares.values())
+
+
+SAMPLE = Path(__file__).parents[2] / "samples/street"
+
+
+@pytest.fixture
+def spoilt(tmp_path):
+    """Makes a copy of the sample, two images a camera, whose calibration a function changes."""
+
+    def make(change) -> Path:
+        drive = tmp_path / "drive"
+        ignore = shutil.ignore_patterns("ground_truth*")
+        shutil.copytree(SAMPLE, drive, ignore=ignore)
+        calibration = json.loads((drive / "calibration.json").read_text())
+        change(calibration["cameras"])
+        (drive / "calibration.json").write_text(json.dumps(calibration))
+        return drive
+
+    return make
+
+
+def in_millimetres(cameras):
+    pose = cameras["CAM_FRONT"]["ego_from_camera"]
+    pose["translation"] = [1000 * metres for metres in pose["translation"]]
+
+
+def test_the_sample_and_the_first_frames_of_it_are_plausible():
+    assert input_errors(open_sequence(SAMPLE)) == ()
+    assert input_errors(open_sequence(SAMPLE, frames=slice(0, 1))) == ()
+
+
+def test_a_camera_in_millimetres_is_one_line(spoilt):
+    drive = spoilt(in_millimetres)
+    (line,) = input_errors(open_sequence(drive), str(drive))
+    assert "camera CAM_FRONT: the translation is in millimetres" in line
+    assert line.endswith(f"`bevcli project-debug {drive}` says more")
+    assert [finding.code for finding in errors_of(check_calibration(drive).findings)] == ["translation-unit"]
+
+
+def test_ego_motion_in_millimetres_is_one_line_of_chosen_frames():
+    drive = open_sequence(SAMPLE, frames=slice(2, 12))
+    motion = drive.ego_motion
+    assert motion is not None
+    drive.ego_motion = replace(motion, translations=1000 * motion.translations)
+    (line,) = input_errors(drive)
+    assert "wrong unit of timestamps or translations" in line
+
+
+def test_the_command_names_the_error_before_the_run(spoilt, tmp_path):
+    drive = spoilt(in_millimetres)
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+    done = command(tmp_path, "run", str(drive), "--model", "mini.toml", "--untrained", "--frames", "0:1")
+    assert done.returncode == 0, done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "millimetres" in line]
+    assert "divide the translation by 1000" in line
+    assert f"bevcli project-debug {drive}" in line
+    assert f"bevcli project-debug {drive}" in done.stdout  # of the summary
+    (note,) = json.loads((tmp_path / "runs/drive-mini/summary.json").read_text())["notes"][:1]
+    assert "millimetres" in note

@@ -1,33 +1,43 @@
-"""map_lines.json, plan.csv and futures: a run of a model that plans writes them, and we read them back."""
+"""Files of results: of models that plan, of a new type, boxes in images, and notes on all images of a drive."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from interrupted import run_frames
-from memory_drive import MemoryDrive
+from memory_drive import MemoryDrive, WithoutImages
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp, Ground
+from bevcli.frame import CameraImage, FrameResult, FrameStamp, Ground, GroundLines
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference.load import Model
 from bevcli.inference.run import Session, run
 from bevcli.inference.runner import read_commands, with_command
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
+from bevcli.model.image_boxes import ImageBoxes
+from bevcli.model.nanodet import NanoDet, NanoDetConfig
+from bevcli.model.step import ModelOutputs
+from bevcli.recording import entities
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
+from bevcli.sequences.files.incremental_json import GrowingFile
+from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines, read_lines
 from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
 from bevcli.workshop.vad.plan import Plan, read_plans
 from bevcli.workshop.vad.vad import VAD, VADConfig
+from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 FRAMES = 3
 MOTION = MotionConfig(modes=2, steps=3, step_s=0.5, attention_heads=4, feed_forward_width=32)
@@ -176,3 +186,170 @@ def test_a_wrong_command_leaves_a_session_as_it_was(model: Model) -> None:
     assert session.frame is None
     with pytest.raises(InputError, match=r"`command=up` .*: is unknown"):
         Session(model, drive.rig, command="up")
+
+
+RED = (255, 0, 0)
+
+
+class StopLineFile(GrowingFile):
+    """stop_lines.txt: the distance of the stop line, a frame a line."""
+
+    def __init__(self, path: Path, frame_of_reference: str, extras: Mapping[str, Any], resume_at: int | None) -> None:
+        super().__init__(path, resume_at)
+
+    def write(self, ground: Ground, result: StopLine | None) -> None:
+        self.append(f"{ground.stamp.index} {None if result is None else result.ahead_m}\n".encode())
+
+
+@dataclass(frozen=True)
+class StopLine(FrameResult):
+    """A line across the lane, so many metres ahead."""
+
+    kind = "stop_line"
+    file_name = "stop_lines.txt"
+    writer = StopLineFile
+
+    ahead_m: float
+
+    @classmethod
+    def legend(cls, names):
+        return dict.fromkeys(names, RED)
+
+    def drawn(self, ground, names, score):
+        return GroundLines([ground.points(np.array([[-2.0, self.ahead_m], [2.0, self.ahead_m]]))], [(*RED, 255)], 2.0)
+
+
+@dataclass(frozen=True)
+class StoppingConfig(ModelConfig):
+    @property
+    def results(self):
+        return {StopLine: ("stop line",)}
+
+
+class Stopping(BEVFormer):
+    def decode(self, outputs: ModelOutputs) -> Iterator[Any]:
+        yield from super().decode(outputs)
+        yield StopLine(10.0)
+
+
+def test_a_new_result_has_a_file_a_drawing_and_a_legend(mini_config, tmp_path):
+    settings = {field.name: getattr(mini_config, field.name) for field in fields(ModelConfig)}
+    model = Model(Stopping(StoppingConfig(**settings)).eval())
+    run_into_folder(model, MemoryDrive(2), tmp_path / "out")
+    assert (tmp_path / "out/stop_lines.txt").read_text() == "0 10.0\n1 10.0\n"
+    for frame in RecordingReader(tmp_path / "out/recording.rrd").frames():
+        (line,) = frame.strips(f"{entities.BEV}/stop_line", "LineStrips2D:strips")
+        np.testing.assert_allclose(line, [[-2, -10], [2, -10]], atol=1e-3)
+        assert frame.texts(entities.RUN, "line_names")[0] == "stop line"
+        from_above = draw_frame(frame, tiles(frame), RecordedImages())[:, 1280:].astype(int)
+        assert (np.abs(from_above - RED[::-1]).max(-1) < 60).sum() > 10
+
+
+IN_IMAGE = [32.5, 18.5, 160.5, 90.5]  # of the box in the images of 320 x 180, of which the network sees half
+PERSON = np.array(NUSCENES_CLASSES["pedestrian"].color)
+
+
+@pytest.fixture
+def detecting_model(mini_config, monkeypatch) -> Model:
+    """It sees a person of score 0.9 and a weak one of 0.1 in each image."""
+
+    def seen(backbone, maps, has_image, sizes=None):
+        boxes = torch.tensor([16.0, 9.0, 80.0, 45.0]).expand(*has_image.shape, 2, 4)
+        scores = torch.tensor([0.9, 0.1]) * has_image[..., None]
+        none = boxes[..., :0]
+        return ImageBoxes(boxes, scores, torch.zeros(scores.shape, dtype=torch.int64), none, none, none)
+
+    monkeypatch.setattr(NanoDet, "image_boxes", seen)
+    return Model(BEVFormer(replace(mini_config, backbone=NanoDetConfig(output_stages=(1,)))).eval())
+
+
+def test_a_prediction_has_the_boxes_of_each_camera(detecting_model, mini_model):
+    [(_, prediction)] = run(detecting_model, MemoryDrive(1))
+    assert list(prediction.image_boxes) == list(prediction.camera_embeddings)
+    strong, weak = prediction.image_boxes["CAM_BACK"]
+    assert (strong.class_name, strong.score, weak.score) == ("person", pytest.approx(0.9), pytest.approx(0.1))
+    np.testing.assert_allclose(strong.corners, IN_IMAGE)
+    [(_, without)] = run(Model(mini_model), MemoryDrive(1))
+    assert without.image_boxes is None
+
+
+def test_a_plot_shows_those_of_its_score(detecting_model):
+    [(_, prediction)] = run(detecting_model, MemoryDrive(1))
+    images = [replace(prediction, image_boxes=boxes).plot("CAM_FRONT") for boxes in (prediction.image_boxes, None)]
+    rows, columns = np.nonzero((images[0] != images[1]).any(-1))
+    np.testing.assert_allclose((columns.min(), rows.min(), columns.max(), rows.max()), IN_IMAGE, atol=2)
+    hidden = [
+        replace(prediction, image_boxes=boxes).plot("CAM_FRONT", score=0.95) for boxes in (None, prediction.image_boxes)
+    ]
+    assert (hidden[0] == hidden[1]).all()
+
+
+def test_a_run_writes_and_draws_them(detecting_model, mini_model, tmp_path):
+    run_into_folder(detecting_model, WithoutImages({1: "all"}, count=2), tmp_path / "out")
+    lines = (tmp_path / "out/image_boxes.csv").read_text().splitlines()
+    assert lines[0] == "frame,scene,timestamp_ns,camera,class,score,x0,y0,x1,y1"
+    assert lines[1] == "0,a,1000000000000000000,CAM_FRONT,person,0.9,32.5,18.5,160.5,90.5"
+    assert len(lines) == 1 + 6 * 2
+    entity = entities.overlay("CAM_BACK", "image_boxes")
+    for frame, count in zip(RecordingReader(tmp_path / "out/recording.rrd").frames(), (1, 0), strict=True):
+        strips = frame.strips(entity, "LineStrips2D:strips")
+        assert len(strips) == count
+        np.testing.assert_allclose([strip[[0, 2]].ravel() for strip in strips], [IN_IMAGE] * count)
+        in_video = draw_frame(frame, tiles(frame), RecordedImages())[:500, :1280].astype(int)
+        assert ((np.abs(in_video - PERSON[::-1]).max(-1) < 20).sum() > 100) == count
+    run_into_folder(Model(mini_model), MemoryDrive(1), tmp_path / "other")
+    assert not (tmp_path / "other/image_boxes.csv").exists()
+
+
+MINIMAL = RunOptions(recording=RecordingOptions(level="minimal"))
+
+
+def test_a_run_without_any_image_is_an_error(mini_model, tmp_path):
+    drive = WithoutImages({0: "all", 1: "all"}, count=2)
+    with pytest.raises(InputError, match=r"memory: not one image could be read \(camera CAM_FRONT: missing\)"):
+        run_into_folder(Model(mini_model), drive, tmp_path / "none", MINIMAL)
+    assert list(tmp_path.iterdir()) == []  # what would stand in the way of the corrected command
+    with_one = run_into_folder(Model(mini_model), WithoutImages({0: "all"}, count=2), tmp_path / "none", MINIMAL)
+    assert with_one.counts.skipped == [0]
+
+
+class BreaksOff(MemoryDrive):
+    """The second frame cannot be read."""
+
+    broken = 1
+
+    def load(self, place):
+        if place == self.broken:
+            raise InputError("an image has another size")
+        return super().load(place)
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_a_run_that_fails_at_once_leaves_nothing(mini_model, tmp_path, broken):
+    """Beside what was in the folder before. With a frame, there is something to resume."""
+    (tmp_path / "before").mkdir()
+    drive = BreaksOff(3)
+    drive.broken = broken
+    for name in ("new", "before"):
+        with pytest.raises(InputError, match="another size"):
+            run_into_folder(Model(mini_model), drive, tmp_path / name, MINIMAL)
+        assert (tmp_path / name / "summary.json").exists() == (broken == 1)
+    assert broken == 1 or list(tmp_path.iterdir()) == [tmp_path / "before"]
+    run_into_folder(Model(mini_model), MemoryDrive(3), tmp_path / "before", MINIMAL, resume=broken == 1)
+
+
+class TwelveBitsInSixteen(MemoryDrive):
+    """The images of one camera have 12 bits that are stored in 16, of which a reader keeps the upper 8."""
+
+    def load(self, place):
+        frame = super().load(place)
+        image = frame.images["CAM_BACK"]
+        dark = CameraImage(image.timestamp_ns, (image.pixels_bgr.astype(np.uint16) * 16 // 256).astype(np.uint8))
+        return replace(frame, images={**frame.images, "CAM_BACK": dark})
+
+
+def test_images_that_are_black_throughout_are_said(mini_model, tmp_path):
+    summary = run_into_folder(Model(mini_model), TwelveBitsInSixteen(2), tmp_path, MINIMAL)
+    said = "all images of CAM_BACK are nearly black or white"
+    assert said in summary.table()
+    assert any(said in note for note in json.loads((tmp_path / "summary.json").read_text())["notes"])

@@ -1,7 +1,5 @@
 """Ground truth from files of labelling tools: a CSV table as spreadsheets write it, and KITTI's."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,17 +1,22 @@
-"""The same real drive as a native folder, as six lossless videos, and as a nuScenes root gives the same frames."""
+"""The same real drive as a native folder, six videos and a nuScenes root gives the same frames."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from memory_drive import MemoryDrive
 
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats import WriteOptions
+from bevcli.workshop.formats.convert import open_writer, truth_left_out
+from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter
 
 
@@ -117,3 +122,29 @@ def test_without_can_bus_kinematics_come_from_the_poses(nuscenes_root, tmp_path)
         np.testing.assert_allclose(a.velocity, b.velocity, atol=0.3)
         np.testing.assert_allclose(a.angular_rate[2], b.angular_rate[2], atol=0.03)
         np.testing.assert_allclose(a.acceleration, b.acceleration, atol=0.8)
+
+
+LINE = np.array([[1.0, 2.0], [3.0, 14.0]])
+
+
+def with_lines(drive: MemoryDrive, index: int):
+    return replace(drive.load(index), ground_truth_results=(MapLines((LINE,), np.array(["divider"])),))
+
+
+def test_a_sequence_folder_keeps_the_lines_of_each_frame(tmp_path):
+    drive = MemoryDrive(2)
+    for source, target in ((None, "one"), ("one", "two")):
+        read = None if source is None else open_sequence(tmp_path / source)
+        with open_writer(tmp_path / target, drive, WriteOptions()) as writer:
+            for place in range(2):
+                writer.write(with_lines(drive, place) if read is None else read.load(place))
+    read = open_sequence(tmp_path / "two")
+    for place in range(2):
+        (lines,) = read.load(place).ground_truth_results
+        assert list(lines.classes) == ["divider"]
+        np.testing.assert_allclose(lines.points[0], LINE, atol=0.005)
+
+
+@pytest.mark.parametrize(("form", "expected"), [("native", set()), ("nuscenes", {"lines of the map"})])
+def test_a_format_names_the_truth_that_it_leaves_out(form, expected):
+    assert truth_left_out(with_lines(MemoryDrive(1), 0), form) == expected

@@ -1,4 +1,4 @@
-"""The meshes: enough variants, plausible sizes, closed surfaces, and boxes that fit."""
+"""The meshes: enough variants, plausible sizes, closed surfaces, boxes that fit; varied looks and roadside objects."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,12 @@ import pytest
 
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.workshop.synth.catalog import Assets, draw_body
+from bevcli.workshop.synth.city import STOP_LINE_M, CityPlan
+from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
+from bevcli.workshop.synth.looks import bent, recoloured
 from bevcli.workshop.synth.mesh import linear
+from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
+from bevcli.workshop.synth.simulation import Roadside, StandingActor
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")
 # Smallest and largest plausible length, width and height of each class, metres.
@@ -76,3 +81,96 @@ def test_linear_rgb_of_white_black_and_grey():
     np.testing.assert_allclose(linear((255, 255, 255)), 1.0)
     np.testing.assert_allclose(linear((0, 0, 0)), 0.0)
     assert 0.20 < linear((128, 128, 128))[0] < 0.23
+
+
+def rendered(assets: Assets, index: int, varied: bool) -> RenderedFrame:
+    return RenderedDrive(5, 2, rig=DrawnRig(nuscenes_like_rig(96, 54), varied=varied), assets=assets).frame(index)
+
+
+def test_varied_looks_change_the_images_and_keep_the_boxes(assets: Assets) -> None:
+    plain, varied, again = rendered(assets, 1, False), rendered(assets, 1, True), rendered(assets, 1, True)
+
+    np.testing.assert_array_equal(varied.boxes.centers, plain.boxes.centers)
+    np.testing.assert_array_equal(varied.boxes.sizes_lwh, plain.boxes.sizes_lwh)
+    np.testing.assert_array_equal(varied.boxes.classes, plain.boxes.classes)
+    for name, image in plain.images.items():
+        assert np.abs(varied.images[name].astype(int) - image).mean() > 5
+        np.testing.assert_array_equal(again.images[name], varied.images[name])
+
+
+def test_individuals_of_a_drive_look_different(assets: Assets) -> None:
+    random, mesh = np.random.default_rng(0), assets.by_class["car"][0].poses[0]
+    one, other = bent(mesh, random), bent(mesh, random)
+
+    assert np.abs(one.faces - other.faces).max() > 0.02
+    assert (recoloured(mesh, random).albedo != recoloured(mesh, random).albedo).any()
+
+
+def test_a_bent_mesh_stays_symmetric_and_near_its_cuboid(assets: Assets) -> None:
+    mesh = assets.by_class["car"][0].poses[0]
+    size = mesh.extents
+
+    for seed in range(20):
+        points = bent(mesh, np.random.default_rng(seed)).faces.reshape(-1, 3)
+        mirrored = points * (1, -1, 1)
+        assert abs(points[:, 1].max() + points[:, 1].min()) < 1e-5
+        assert np.ptp(points, axis=0).max() < 1.2 * size.max()
+        np.testing.assert_allclose(np.sort(mirrored[:, 1]), np.sort(points[:, 1]), atol=1e-5)
+
+
+def test_a_share_of_varied_drives_leaves_the_rigs_as_they_are() -> None:
+    plain, varied = RigDistribution(random_share=0.5), RigDistribution(random_share=0.5, varied_share=0.5)
+    drawn = [(draw_rig(plain, seed, (96, 54)), draw_rig(varied, seed, (96, 54))) for seed in range(40)]
+
+    assert not any(one.varied for one, _ in drawn)
+    assert 10 < sum(other.varied for _, other in drawn) < 30
+    for one, other in drawn:
+        assert one.rig.names == other.rig.names
+        assert one.jpeg_quality == other.jpeg_quality
+    assert RigDistribution().digest != RigDistribution(varied_share=0.5).digest
+
+
+WORKS = ("barrier-", "cone-", "machine-", "worker-")
+
+
+class EvenCity(CityPlan):
+    """A city whose streets all have the same distance."""
+
+    def __init__(self, seed: int, spacing_m: float) -> None:
+        super().__init__(seed)
+        self.spacing_m = spacing_m
+
+    def _make_position(self, axis: int, index: int) -> float:
+        return index * self.spacing_m
+
+
+def standing(city: CityPlan, assets: Assets) -> list[tuple[StandingActor, int, int, int]]:
+    """The actors at the kerbs of 60 stretches, each with axis, street and crossing street."""
+    roadside = Roadside(city, assets)
+    stretches = [(axis, index, cross) for axis in (0, 1) for index in range(5) for cross in range(6)]
+    return [(actor, *stretch) for stretch in stretches for actor in roadside.stretch(*stretch)]
+
+
+@pytest.mark.parametrize(("spacing_m", "has_works"), [(45.0, False), (100.0, True)])
+def test_only_stretches_with_room_have_road_works(assets: Assets, spacing_m: float, has_works: bool):
+    """Road works are at least 15 m long. With 45 m between the streets no stretch has that much room."""
+    names = [actor.body.instance for actor, *_ in standing(EvenCity(3, spacing_m), assets)]
+    assert any(name.startswith("parked") for name in names)
+    assert any(name.startswith(WORKS) for name in names) == has_works
+
+
+@pytest.mark.parametrize("spacing_m", [45.0, 66.0, 100.0])
+def test_all_at_a_kerb_is_between_stop_lines_on_the_parking_lane(assets: Assets, spacing_m: float):
+    city = EvenCity(3, spacing_m)
+    checked = 0
+    for actor, axis, index, cross in standing(city, assets):
+        street = city.street(axis, index)
+        before, after = city.street(1 - axis, cross), city.street(1 - axis, cross + 1)
+        plan = city.unbend(actor.position[:2])
+        along, across = plan[axis], abs(plan[1 - axis] - street.position)
+        half = actor.body.size_lwh[0] / 2 if actor.body.instance.startswith("parked") else 0.0
+        assert along - half > before.position + before.half_width + STOP_LINE_M
+        assert along + half < after.position - after.half_width - STOP_LINE_M
+        assert street.half_width - street.parking_m - 0.5 < across < street.half_width
+        checked += 1
+    assert checked > 50

@@ -1,7 +1,5 @@
 """Perspective targets of a single image, sparse."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

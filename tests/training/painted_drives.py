@@ -1,7 +1,5 @@
 """Drives of two cameras in memory: boxes are drawn as coloured shapes on grey ground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

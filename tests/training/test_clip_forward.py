@@ -1,6 +1,4 @@
-"""The forward passes of a clip: they equal inference, and a BEVFormerV2 can be trained with its window."""
-
-from __future__ import annotations
+"""The forward passes of a clip: they equal inference, with a window of a BEVFormerV2 and with frozen stages too."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -14,14 +12,15 @@ from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
-from bevcli.workshop.training.clip_steps import forward_clip
+from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
-from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, prepare_training
+from bevcli.workshop.training.job import OptimizerConfig, ProcessGroup, TrainingConfig, TrainingJob, prepare_training
 from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
 from bevcli.workshop.training.trainer import Trainer
@@ -161,3 +160,54 @@ def test_four_clips_can_be_overfitted_with_a_window(tmp_path: Path) -> None:
     header, last = (tmp_path / "validation.csv").read_text().splitlines()
     scores = dict(zip(header.split(","), map(float, last.split(",")), strict=True))
     assert scores["mAP"] > 0.8
+
+
+def made_backbone() -> ResNet:
+    torch.manual_seed(3)
+    backbone = ResNet(ResNetConfig(blocks=(1, 2, 1, 1), output_stages=(2, 3), width=8))
+    for name, values in backbone.named_buffers():
+        if "running" in name:
+            values.uniform_(0.5, 1.5)
+    for parameter in backbone.parameters():
+        if parameter.ndim == 1:
+            torch.nn.init.uniform_(parameter, 0.5, 1.5)
+    return backbone.eval()
+
+
+def test_frozen_stages_give_the_same_maps_and_gradients() -> None:
+    backbone, images = made_backbone(), torch.randn(3, 3, 64, 96)
+    backbone.freeze(2)
+    frozen = FrozenStages(backbone, 2, torch.float32)
+    results = []
+    for context in (frozen.used_by(backbone), torch.enable_grad()):
+        with context:
+            maps = backbone(images)
+        backbone.zero_grad()
+        maps[-1].square().mean().backward()
+        gradients = [parameter.grad for parameter in backbone.parameters() if parameter.grad is not None]
+        results.append([*maps, *gradients])
+    assert len(results[0]) > 8
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+    assert backbone.frozen_maps is None
+
+
+def test_more_frozen_stages_than_the_backbone_has_are_all_of_it() -> None:
+    backbone, images = made_backbone(), torch.randn(1, 3, 64, 96)
+    with FrozenStages(backbone, 4, torch.float32).used_by(backbone):
+        found = backbone(images)
+    for one, expected in zip(found, backbone(images), strict=True):
+        torch.testing.assert_close(one, expected, rtol=1e-3, atol=1e-4)
+        assert not one.requires_grad
+
+
+def test_several_processes_leave_frozen_parts_without_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a gradient of zero, weight decay would change them."""
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda sums: sums.mul_(2))
+    layers = torch.nn.ModuleList(torch.nn.Linear(2, 2) for _ in range(3))
+    layers[0].requires_grad_(False)
+    layers[1].weight.grad = torch.ones(2, 2)
+    ProcessGroup(0, 2).average_gradients(layers)
+    assert [parameter.grad for parameter in layers[0].parameters()] == [None, None]
+    assert layers[1].weight.grad.equal(torch.ones(2, 2))
+    assert not layers[2].weight.grad.any()

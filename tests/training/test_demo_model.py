@@ -1,7 +1,5 @@
 """The demo model: small enough to be part of the package, with every part of BEVFormer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

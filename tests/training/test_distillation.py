@@ -1,7 +1,5 @@
 """Distillation: a model learns the BEV maps of a teacher, which sees clips without augmentation, or its features."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A training looks at its drives before it writes anything: classes, ground truth, lengths and the split."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,19 +1,24 @@
-"""Losses against values computed by hand, and the Hungarian matching against every permutation."""
+"""Losses against values computed by hand, and the Hungarian matching against every permutation.
 
-from __future__ import annotations
+The losses of a batch are those of its frames, weighted by their numbers of objects: values and gradients.
+"""
 
+from collections.abc import Callable, Mapping, Sequence
 from itertools import permutations
 from math import exp, log
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.workshop.training.losses import (
     DenseHead,
     DenseLossConfig,
     DetectionLossConfig,
+    SegmentationLossConfig,
     dense_loss,
     detection_loss,
     dice_costs,
@@ -21,8 +26,9 @@ from bevcli.workshop.training.losses import (
     focal_cost,
     focal_loss,
     hungarian_matchings,
+    segmentation_loss,
 )
-from bevcli.workshop.training.targets import DetectionTargets
+from bevcli.workshop.training.targets import DetectionTargets, SegmentationTargets, padded, padded_masks
 
 
 def pairs(costs: torch.Tensor, truths: int | None = None) -> tuple[list[int], list[int]]:
@@ -187,3 +193,154 @@ def test_a_frame_without_objects_has_negatives_only() -> None:
     loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig())
     assert loss["cell boxes"].item() == 0
     assert loss["cell classes"].item() > 0
+
+
+COUNTS = (1, 5, 2)  # objects of the frames; a batch is padded to 5
+RANDOM = torch.Generator().manual_seed(0)
+
+
+def drawn(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=RANDOM)
+
+
+def truths() -> list[DetectionTargets]:
+    return [DetectionTargets(torch.randint(4, (count,), generator=RANDOM), drawn(count, 10)) for count in COUNTS]
+
+
+def assert_mean_of_frames(
+    loss: Callable[[slice], Mapping[str, Tensor]], leaves: list[Tensor], counts: Sequence[int] = COUNTS
+) -> None:
+    """Each loss of the batch is the mean of those of its frames, weighted by these counts; so are the gradients.
+
+    loss: of some of the frames.
+    """
+    frames = [loss(slice(b, b + 1)) for b in range(len(counts))]
+    for name, value in loss(slice(None)).items():
+        expected = torch.stack([one[name] * count for one, count in zip(frames, counts, strict=True)]).sum() / sum(
+            counts
+        )
+        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
+        gradients = (
+            torch.autograd.grad(one, leaves, retain_graph=True, materialize_grads=True) for one in (value, expected)
+        )
+        for found, apart in zip(*gradients, strict=True):
+            torch.testing.assert_close(found, apart, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("quality_m", [0.0, 2.0])
+def test_the_detection_loss_of_a_batch_is_that_of_its_frames(quality_m: float) -> None:
+    logits, codes, truth = drawn(2, 3, 24, 4).requires_grad_(), drawn(2, 3, 24, 10).requires_grad_(), truths()
+    config = DetectionLossConfig(moving_weight=5.0, quality_m=quality_m)
+    assert_mean_of_frames(
+        lambda part: detection_loss(logits[:, part], codes[:, part], padded(truth[part]), config, 3), [logits, codes]
+    )
+
+
+def test_the_dense_loss_of_a_batch_is_that_of_its_frames() -> None:
+    grid = BevGrid(16, 16, (-8, 8), (-8, 8), (-3, 3), 4)
+    head, truth, bev = DenseHead(8, 4, grid), truths(), drawn(3, 256, 8).requires_grad_()
+    cells = torch.from_numpy(grid.cell_centers()).reshape(-1, 2)
+    near = [(cells[:, None] - one.codes[:, :2]).norm(dim=-1).min(1).values <= 1.5 for one in truth]
+    assert_mean_of_frames(
+        lambda part: dense_loss(head, bev[part], padded(truth[part]), DenseLossConfig(1.0, 1.5), DetectionLossConfig()),
+        [bev],
+        [int(cells.sum()) for cells in near],
+    )
+
+
+@pytest.mark.parametrize(("counts", "with_map"), [(COUNTS, False), ((2, 2, 2), True)])
+def test_the_map_losses_of_a_batch_are_those_of_its_frames(counts: tuple[int, ...], with_map: bool) -> None:
+    """Stuff and things are divided by numbers of their own: with maps, all frames have as many of both."""
+    truth = [
+        SegmentationTargets(
+            (drawn(3, 36) > 0).float() if with_map else None, (drawn(n, 36) > 0.5).float(), drawn(n, 4).sigmoid()
+        )
+        for n in counts
+    ]
+    masks, classes = drawn(2, 3, 11, 36).requires_grad_(), drawn(2, 3, 11).requires_grad_()
+    places = drawn(2, 3, 8, 4).sigmoid().requires_grad_()
+
+    def loss(part: slice) -> Mapping[str, Tensor]:
+        outputs = SegmentationOutputs(masks[:, part], classes[:, part], places[:, part])
+        return segmentation_loss(outputs, padded_masks(truth[part]), SegmentationLossConfig())
+
+    assert_mean_of_frames(loss, [masks, classes, places], counts)
+
+
+MAP_WEIGHTS = SegmentationLossConfig(class_weight=1.0, location_weight=2.0, dice_weight=3.0, pixel_weight=4.0)
+LEFT, RIGHT, NOTHING = [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0] * 4
+
+
+def outputs(masks: Tensor, classes: list[float], locations: list[list[float]]) -> SegmentationOutputs:
+    """One layer, one frame; masks of 0 and 1 become logits of large magnitude."""
+    return SegmentationOutputs(
+        80 * (masks - 0.5)[None, None], 40 * (torch.tensor(classes) - 0.5)[None, None], torch.tensor([[locations]])
+    )
+
+
+PERFECT = outputs(
+    torch.tensor([[1.0] * 4, NOTHING, LEFT, RIGHT, LEFT]),
+    [1, 0, 1, 1, 1],
+    [[0.75, 0.5, 0.5, 1.0], [0.25, 0.5, 0.5, 1.0]],
+)
+TRUTH = SegmentationTargets(
+    stuff=torch.tensor([[1.0] * 4, NOTHING, LEFT]),
+    things=torch.tensor([LEFT, RIGHT]),
+    locations=torch.tensor([[0.25, 0.5, 0.5, 1.0], [0.75, 0.5, 0.5, 1.0]]),
+)
+
+
+def test_a_perfect_output_has_no_loss_in_any_order_of_its_things() -> None:
+    assert total(segmentation_loss(PERFECT, [TRUTH], MAP_WEIGHTS)) == pytest.approx(0, abs=1e-4)
+
+
+def test_the_location_loss_is_the_distance() -> None:
+    moved = SegmentationOutputs(
+        PERFECT.mask_logits, PERFECT.class_logits, PERFECT.locations + torch.tensor([0.1, 0, 0, 0])
+    )
+    loss = segmentation_loss(moved, [TRUTH], MAP_WEIGHTS)
+    assert loss["locations"].item() == pytest.approx(2.0 * (2 * 0.1) / 2)  # two things in the frame
+    assert loss["masks"].item() == pytest.approx(0, abs=1e-4)
+
+
+def test_an_undecided_mask_has_dice_and_focal_loss() -> None:
+    logits = PERFECT.mask_logits.clone()
+    logits[0, 0, 2] = 0  # the crossing: probability 1/2 in all four cells, two of which are crossing
+    loss = segmentation_loss(SegmentationOutputs(logits, PERFECT.class_logits, PERFECT.locations), [TRUTH], MAP_WEIGHTS)
+    dice = 1 - 2 * 1 / (4 * 0.25 + 2)
+    pixels = (0.25 + 0.75) / 2 * 0.25 * log(2)
+    assert loss["masks"].item() == pytest.approx((3 * dice + 4 * pixels) / 2, rel=1e-3)  # two masks of stuff
+
+
+def test_a_wrong_class_has_focal_loss() -> None:
+    logits = PERFECT.class_logits.clone()
+    logits[0, 0, 1] = 0  # lane boundary with probability 1/2, where there is none
+    loss = segmentation_loss(SegmentationOutputs(PERFECT.mask_logits, logits, PERFECT.locations), [TRUTH], MAP_WEIGHTS)
+    assert loss["map classes"].item() == pytest.approx(0.75 / 4 * log(2) / 2, rel=1e-3)
+
+
+def test_a_frame_without_a_map_has_no_stuff_loss() -> None:
+    unknown = SegmentationTargets(None, TRUTH.things, TRUTH.locations)
+    wrong = outputs(
+        torch.tensor([NOTHING, LEFT, RIGHT, RIGHT, LEFT]),
+        [0, 1, 1, 1, 1],
+        [[0.75, 0.5, 0.5, 1.0], [0.25, 0.5, 0.5, 1.0]],
+    )
+    assert total(segmentation_loss(wrong, [unknown], MAP_WEIGHTS)) == pytest.approx(0, abs=1e-4)
+
+
+def test_every_mask_layer_has_a_loss() -> None:
+    logits = torch.cat([torch.zeros_like(PERFECT.mask_logits), PERFECT.mask_logits])
+    two = SegmentationOutputs(logits, PERFECT.class_logits.expand(2, -1, -1), PERFECT.locations)
+    assert segmentation_loss(two, [TRUTH], MAP_WEIGHTS)["masks"].item() > 0.5
+
+
+def test_vehicles_do_not_lower_the_weight_of_the_road() -> None:
+    logits = PERFECT.mask_logits.clone()
+    logits[0, 0, 0] = 0  # the road is undecided
+    one_wrong = SegmentationOutputs(logits, PERFECT.class_logits, PERFECT.locations)
+    without_things = SegmentationTargets(TRUTH.stuff, TRUTH.things[:0], TRUTH.locations[:0])
+    with_things = segmentation_loss(one_wrong, [TRUTH], MAP_WEIGHTS)["masks"].item()
+    assert with_things == pytest.approx(
+        segmentation_loss(one_wrong, [without_things], MAP_WEIGHTS)["masks"].item(), abs=1e-4
+    )

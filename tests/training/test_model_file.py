@@ -1,7 +1,5 @@
 """A model file for a data set follows from its drives, can be trained as it is, and states the cost."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The perspective loss: what it learns, what it ignores, and that it trains the image backbone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Several processes that train one model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

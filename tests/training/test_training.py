@@ -1,7 +1,5 @@
 """The training as a whole: it converges, is reproducible, resumes after a kill and rejects invalid input."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """docs/training.md lists every key of the [training] table with its default."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """An update of a training on a simulated GPU: nothing is on the wrong device, and the CPU waits as seldom as stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
