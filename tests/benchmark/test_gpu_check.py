@@ -21,6 +21,7 @@ def test_without_a_gpu_it_says_so_in_one_line(device, capsys, tmp_path):
     assert not (tmp_path / "report.md").exists()
 
 
+@pytest.mark.slow
 def test_a_device_that_agrees_with_the_cpu_passes(small_model_file, monkeypatch):
     monkeypatch.setattr(gpu_check, "PRECISIONS", ("fp32", "bf16"))
     monkeypatch.setattr(gpu_check, "COMPARED_ON_CPU", (str(small_model_file),))

@@ -94,12 +94,6 @@ def test_ego_motion_inputs_equal_the_originals(model: BEVFormer, frame: int) -> 
 
 
 SHARED = os.environ.get("BEVCLI_SHARED", "")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.timeout(3600),
-    pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED is not set: no full numbers of the original"),
-]
-
 # Share of cells that may differ: where the nearest-neighbour rotation meets a tie, a cell may take its neighbour's
 # history.
 SHARE_OFF = {"tiny": 0.0, "base": 1e-3}
@@ -132,6 +126,9 @@ class Golden:
         return self.arrays[f"f{frame}_{name}"]
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(not SHARED, reason="BEVCLI_SHARED is not set: no full numbers of the original")
 @pytest.mark.parametrize(
     ("name", "history_shift", "count"),
     [("tiny", "history", 4), ("tiny", "both", 3), ("base", "history", 4), ("base", "both", 2)],

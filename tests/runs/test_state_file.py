@@ -157,7 +157,7 @@ def test_without_values_or_at_a_time_of_zero_the_median_is_given():
 MIB = 1 << 20
 DESCRIPTORS = Path("/proc/self/fd")
 
-pytestmark = pytest.mark.skipif(not DESCRIPTORS.exists(), reason="the process is measured on Linux")
+on_linux = pytest.mark.skipif(not DESCRIPTORS.exists(), reason="the process is measured on Linux")
 
 
 class SmallDrive(MemoryDrive):
@@ -223,12 +223,14 @@ def assert_flat(found: list[Usage], growth: int, peak: int) -> None:
         assert max(getattr(later, name) for later in found) <= getattr(first, name) + 3, name
 
 
+@on_linux
 @pytest.mark.slow
 def test_memory_files_threads_and_sockets_stay_flat(mini_model, tmp_path):
     # An index would take 34 MB after these 100 frames; rerun's buffers come and go by up to 10 MB.
     assert_flat(measured_run(mini_model, tmp_path / "out", 120, range(20, 120, 10)), 14 * MIB, 14 * MIB)
 
 
+@on_linux
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_ten_thousand_frames_take_the_memory_of_a_hundred(mini_config, tmp_path):
