@@ -17,7 +17,7 @@ from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, SHOWN_SCORE, Color, ObjectClass
-from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply
+from bevcli.geometry.transforms import Array, GeoOrigin, Pose, apply, inverse
 from bevcli.printing import counted, valid_text
 
 if TYPE_CHECKING:
@@ -213,6 +213,15 @@ class Frame:
         if self.impossible_boxes:
             texts.append(f"{where}: {counted(self.impossible_boxes, 'true boxes')} {IMPOSSIBLE}")
         return texts
+
+    def sees(self, boxes: Boxes3D) -> NDArray[np.bool_]:
+        """(N,) bool, boxes of the world frame whose vertical axis is in an image: its foot, its middle or its top."""
+        points = boxes.centers[:, None] + boxes.sizes_lwh[:, None, 2:] * [[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]]
+        seen = np.zeros(len(boxes), dtype=bool)
+        for name in self.images:
+            in_ego = apply(inverse(self.world_from_ego_at[name].matrix), points)  # (N, 3, 3)
+            seen |= self.rig[name].sees(in_ego).any(-1)
+        return seen
 
     def __repr__(self) -> str:
         truth = "" if self.ground_truth is None else f", {len(self.ground_truth)} true boxes"

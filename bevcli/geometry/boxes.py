@@ -87,6 +87,7 @@ class Boxes3D:
         duplicates: (N,) whether a better box describes the same object. Optional.
         visibilities: (N,) visible fraction, 0 to 1; NaN if unknown. Optional.
         num_points: (N,) number of lidar and radar points; boxes with 0 are not scored, -1 if unknown. Optional.
+        unseen: (N,) whether no camera with an image sees the place. Optional.
         futures: (N, M, T, 3) M possible futures in T steps: seconds from the boxes' time, then x and y of the centre,
             metres; NaN if unknown. Optional.
         future_scores: (N, M) score of each future, 0 to 1. Optional.
@@ -104,6 +105,7 @@ class Boxes3D:
     duplicates: Annotated[NDArray[np.bool_] | None, Column("duplicate", "flag")] = None
     visibilities: Annotated[Array | None, Column("visibility", "share")] = None
     num_points: Annotated[NDArray[np.int64] | None, Column("num_points", "count")] = None
+    unseen: Annotated[NDArray[np.bool_] | None, Column("unseen", "flag")] = None
     futures: Array | None = None
     future_scores: Array | None = None
 
@@ -141,6 +143,13 @@ class Boxes3D:
     def scored(self, least: float) -> "Boxes3D":
         """The boxes with a score of at least `least`; all boxes where they have no scores."""
         return self if self.scores is None else self[self.scores >= least]
+
+    def shown(self, least: float) -> "Boxes3D":
+        """As `scored`, without the boxes that no camera sees, but for those of a track: history carries these."""
+        boxes = self.scored(least)
+        if boxes.unseen is None:
+            return boxes
+        return boxes[~boxes.unseen if boxes.instances is None else ~boxes.unseen | (boxes.instances != "")]
 
     def possible(self) -> "Boxes3D":
         """The boxes with sizes above 0 and finite numbers; velocities may be unknown."""

@@ -98,6 +98,11 @@ class StepOptions:
         parse=partial(parse_pairs, expected="NAME=MODEL_CAMERA"),
         repeatable=True,
     )
+    unseen: bool = option(
+        default=False,
+        help="Show and count boxes where no camera looks as all others. Default: predictions.json marks them, and they "
+        "are left out, but for those of a track that a camera saw in the last 3 s.",
+    )
     command: str | None = option(
         default=None,
         help="Command of the driver, which marks one of the planned paths of a model that plans: straight, left or "

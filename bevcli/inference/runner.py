@@ -194,6 +194,11 @@ class Runner:
                     part = origin(self.model, lambda: self.model.step(prepared, start.memory, begun.upcoming))
                 after, fields = self._restarted(start), {"not_finite": part}
         prediction = self._prediction(prepared, begun.started_anew, **fields)
+        if not self.options.unseen and len(prediction.boxes):
+            world = prediction.boxes_world
+            unseen = ~prepared.frame.sees(world)
+            prediction = replace(prediction, boxes=replace(prediction.boxes, unseen=unseen))
+            vars(prediction)["boxes_world"] = replace(world, unseen=unseen)  # the cached property
         if self.tracker is not None and not self._tracks:
             tracks, prediction = track(self.tracker, tracks, prediction)
         return replace(after, tracks=tracks), prediction

@@ -30,6 +30,7 @@ class TrackerConfig:
         confirm_frames: number of frames with a box after which a track is confirmed.
         coast_s: time that a confirmed track lives without a box, in seconds. Other tracks end with the first frame
             without a box.
+        carry_s: time that a track lives on boxes where no camera looks, in seconds.
         duplicate_widths: a box is a duplicate when the centre of a better box of its class is closer than this many
             widths of the better box. 0: no box is a duplicate.
         use_velocity: whether tracks move with the predicted velocity; if not, they stay where their last box is.
@@ -41,6 +42,7 @@ class TrackerConfig:
     keep_score: float = 0.1
     confirm_frames: int = 2
     coast_s: float = 1.5
+    carry_s: float = 3.0
     duplicate_widths: float = 1.0
     use_velocity: bool = True
     gates_m: Mapping[str, float] = field(default_factory=dict)
@@ -51,10 +53,10 @@ class TrackerConfig:
                 f"keep_score and birth_score must be 0 to 1, keep_score not above birth_score; found "
                 f"{self.keep_score:g} and {self.birth_score:g}"
             )
-        if self.confirm_frames < 1 or self.coast_s < 0 or self.duplicate_widths < 0:
+        if self.confirm_frames < 1 or self.coast_s < 0 or self.carry_s < 0 or self.duplicate_widths < 0:
             raise ValueError(
-                "confirm_frames must be at least 1, coast_s and duplicate_widths must not be negative; found "
-                f"{self.confirm_frames}, {self.coast_s:g} and {self.duplicate_widths:g}"
+                "confirm_frames must be at least 1, coast_s, carry_s and duplicate_widths must not be negative; found "
+                f"{self.confirm_frames}, {self.coast_s:g}, {self.carry_s:g} and {self.duplicate_widths:g}"
             )
         for name, gate in self.gates_m.items():
             if not gate > 0:
@@ -78,6 +80,7 @@ class Tracks:
         centers_xy: (T, 2) centre of the last box, metres.
         velocities: (T, 2) velocity of the last box, m/s.
         seen_ns: (T,) time of the last box.
+        in_view_ns: (T,) time of the last box where a camera looked.
         frames: (T,) number of frames with a box.
         score_sums: (T,) sum of the scores of these boxes.
     """
@@ -87,6 +90,7 @@ class Tracks:
     centers_xy: Array
     velocities: Array
     seen_ns: NDArray[np.int64]
+    in_view_ns: NDArray[np.int64]
     frames: NDArray[np.int64]
     score_sums: Array
 
@@ -101,7 +105,8 @@ class Tracks:
     def empty() -> "Tracks":
         """No track at all."""
         nothing, no_numbers = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-        return Tracks(no_numbers, np.zeros(0, "<U1"), nothing, nothing, no_numbers, no_numbers, np.zeros(0))
+        times = no_numbers, no_numbers, no_numbers
+        return Tracks(no_numbers, np.zeros(0, "<U1"), nothing, nothing, *times, np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -141,8 +146,9 @@ def step(
     """The state after a frame, and its boxes with their identities.
 
     The boxes have the same order and the columns `instances` ("" for a box without a track), `track_scores` (the mean
-    score of the track's boxes, NaN without a track) and `duplicates`. Tracks start anew with a new scene, and where the
-    time does not advance or advances by more than `coast_s` after the last box.
+    score of the track's boxes, NaN without a track) and `duplicates`. Boxes that no camera sees (`unseen`) come after
+    the others, start no track, and continue one that was in view within the last `carry_s`. Tracks start anew with a
+    new scene, and where the time does not advance or advances by more than `coast_s` after the last box.
 
     Args:
         config: the parameters.
@@ -155,21 +161,23 @@ def step(
     tracks = Tracks.empty()
     if state is not None and state.stamp.scene == stamp.scene and stamp.timestamp_ns > state.stamp.timestamp_ns:
         tracks = state.tracks[stamp.timestamp_ns - state.tracks.seen_ns <= config.coast_s * 1e9]
-    order = np.argsort(-scores, kind="stable")
+    unseen = np.zeros(len(boxes), dtype=bool) if boxes.unseen is None else boxes.unseen
+    order = np.lexsort((-scores, unseen))
     duplicates = find_duplicates(boxes, order, config.duplicate_widths)
     usable = order[~duplicates[order] & (scores[order] >= config.keep_score)]
-    matches = _match(config, tracks, boxes, usable, stamp)
-    born = usable[(matches[usable] < 0) & (scores[usable] >= config.birth_score)]
+    matches = _match(config, tracks, boxes, usable, unseen, stamp)
+    born = usable[(matches[usable] < 0) & (scores[usable] >= config.birth_score) & ~unseen[usable]]
     matches[born] = len(tracks) + np.arange(len(born))
     nothing, nowhere = np.zeros(len(born), dtype=np.int64), np.zeros((len(born), 2))
     numbers, no_scores = number + np.arange(len(born)), np.zeros(len(born))
-    new = Tracks(numbers, boxes.classes[born], nowhere, nowhere, nothing, nothing, no_scores)
+    new = Tracks(numbers, boxes.classes[born], nowhere, nowhere, nothing, nothing, nothing, no_scores)
     tracks = Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
     owned = np.flatnonzero(matches >= 0)
     owners = matches[owned]
     tracks.centers_xy[owners] = boxes.centers[owned, :2]
     tracks.velocities[owners] = boxes.velocities[owned]
     tracks.seen_ns[owners] = stamp.timestamp_ns
+    tracks.in_view_ns[owners[~unseen[owned]]] = stamp.timestamp_ns
     tracks.frames[owners] += 1
     tracks.score_sums[owners] += scores[owned]
     instances = np.full(len(boxes), "", dtype="<U20")
@@ -177,8 +185,8 @@ def step(
     track_scores = np.full(len(boxes), np.nan)
     track_scores[owned] = tracks.score_sums[owners] / tracks.frames[owners]
     tracked = replace(boxes, instances=instances, track_scores=track_scores, duplicates=duplicates)
-    unseen = tracks.seen_ns != stamp.timestamp_ns
-    tracks = tracks[~(unseen & (tracks.frames < config.confirm_frames))]
+    lost = tracks.seen_ns != stamp.timestamp_ns
+    tracks = tracks[~(lost & (tracks.frames < config.confirm_frames))]
     return TrackerState(tracks, stamp, number + len(born)), tracked
 
 
@@ -190,7 +198,7 @@ def without_identities(boxes: Boxes3D) -> Boxes3D:
 def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> NDArray[np.bool_]:
     """Mask (N,) of the boxes on an object that a better box of their class describes already.
 
-    order: (N,) their indices, highest score first. widths: distance of the centres, in widths of the better box.
+    order: (N,) their indices, the best first. widths: distance of the centres, in widths of the better box.
     """
     ranked = boxes[order]
     x, y = ranked.centers[:, :2].T
@@ -208,7 +216,12 @@ def find_duplicates(boxes: Boxes3D, order: NDArray[np.int64], widths: float) -> 
 
 
 def _match(
-    config: TrackerConfig, tracks: Tracks, boxes: Boxes3D, usable: NDArray[np.int64], stamp: FrameStamp
+    config: TrackerConfig,
+    tracks: Tracks,
+    boxes: Boxes3D,
+    usable: NDArray[np.int64],
+    unseen: NDArray[np.bool_],
+    stamp: FrameStamp,
 ) -> NDArray[np.int64]:
     """(N,) the index of each box's track, -1 for none. `usable` (M,): the boxes that may match, best first."""
     matches = np.full(len(boxes), -1)
@@ -220,6 +233,7 @@ def _match(
         places = places + np.nan_to_num(tracks.velocities) * seconds[:, None]
     away = np.linalg.norm(boxes.centers[usable, None, :2] - places, axis=-1)  # (M, T)
     away[boxes.classes[usable, None] != tracks.classes] = np.inf
+    away[unseen[usable, None] & (stamp.timestamp_ns - tracks.in_view_ns > config.carry_s * 1e9)] = np.inf
     other = config.gates_m.get(OTHER, ObjectClass.gate_m)
     gates = [config.gates_m.get(name, other) for name in boxes.classes[usable].tolist()]
     away[away > np.array(gates, dtype=np.float64)[:, None]] = np.inf

@@ -27,6 +27,7 @@ _EDGES = np.array((*BOX_EDGES, *FRONT_EDGES))
 LOWEST_LABELLED = 0.05  # of the image's height: smaller boxes are not labelled
 # Of the image's width and height, for a view that is a third of the screen wide.
 LETTER_WIDTH, LETTER_HEIGHT = 0.019, 0.085
+OUT_OF_VIEW = "out of view"
 UNSEEN = ui_points(0.01)  # of a point that shows only its label
 JPEG_QUALITY = 85  # for images that have no encoded bytes, such as those of a video
 POINT, THIN = ui_points(2.0), ui_points(0.5)
@@ -167,13 +168,18 @@ def labels_2d(positions: ArrayLike, texts: list[str], **options: Any) -> Compone
 
 
 def box_labels(boxes: Boxes3D) -> list[str]:
-    """The text of each label: "car 0.83", "car" where boxes have no scores, "car #12 0.83" for a box of track 12."""
+    """The text of each label: "car 0.83", "car" where boxes have no scores, "car #12 0.83" for a box of track 12.
+
+    One of a track that no camera sees now says so: "car #12 0.83 out of view".
+    """
     texts = [str(name).replace("_", " ") for name in boxes.classes]
     if boxes.instances is not None:
         texts = [f"{text} #{track}" if track else text for text, track in zip(texts, boxes.instances, strict=True)]
-    if boxes.scores is None:
-        return texts
-    return [f"{text} {score:.2f}" for text, score in zip(texts, boxes.scores, strict=True)]
+    if boxes.scores is not None:
+        texts = [f"{text} {score:.2f}" for text, score in zip(texts, boxes.scores, strict=True)]
+    if boxes.unseen is not None:
+        texts = [f"{text} {OUT_OF_VIEW}" if unseen else text for text, unseen in zip(texts, boxes.unseen, strict=True)]
+    return texts
 
 
 def labels_in_image(lines: ImageLines, texts: list[str], width: int, height: int) -> tuple[Array, NDArray[np.int64]]:

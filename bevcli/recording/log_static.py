@@ -46,10 +46,12 @@ TWO_MODELS = """\
 """
 HOW_TO_READ = """\
 - **Predicted boxes** have the colour of their class. The front face is crossed; from above, a line points to the front.
-- **Ground truth** is pale where a prediction matches it, and red where it was missed. Classes that are not scored are
-  grey.
+- **Ground truth** is pale where a prediction matches it or no camera looks, and red where it was missed. Classes that
+  are not scored are grey.
 - **False positives** are crossed out in red: no ground truth of their class is within 2 m.
 - **Duplicates**, a second box on an object, have one grey diagonal.
+- **Boxes where no camera looks** are not shown, but for those of a track that was in view within the last 3 s: their
+  label says "out of view".
 - **Tracks** have a number in their label and a trail: the last 5 s, and, fainter, the next second at the predicted
   velocity. Each is an entity below `world/tracks`; select it there or by a click on its trail.
 """

@@ -333,7 +333,7 @@ class Recording:
             sides, grid = [predicted.boxes], predicted.grid
         else:
             sides, grid = [poses.in_bev(boxes) if boxes else NO_BOXES for boxes in predicted], None
-        sides = [boxes.scored(self._options.score) for boxes in sides]
+        sides = [boxes.shown(self._options.score) for boxes in sides]
         truth = None if frame.ground_truth is None else poses.in_bev(frame.ground_truth)
         truth = None if truth is None else log_boxes.detectable(truth, grid)
         if files is not None and not files.names:  # labels alone are drawn as boxes
@@ -345,6 +345,8 @@ class Recording:
         if truth is not None and is_known and not recorded.layers and not recorded.model.untrained:
             marks = self._marks(sides[0], truth, poses)
             missed = ~marks.found & ~log_boxes.other_classes(truth, recorded.classes)
+            if frame.images:  # elsewhere no model can find it
+                missed &= frame.sees(truth.transformed(poses.pose.matrix @ poses.ego_from_bev))
         if recorded.layers:
             drawn = [self._log_layer(*layer, poses) for layer in zip(recorded.layers.items(), sides, strict=True)]
             none = log_boxes.false_and_duplicate(NO_BOXES, None)
@@ -421,7 +423,7 @@ class Recording:
             result = result_of(cls, prediction.results)
             lines = GroundLines() if result is None else result.drawn(ground, names, score)
             log_ground_lines(self._stream, cls.kind, lines, world_from_bev, cameras)
-        shown = prediction.boxes.scored(score).transformed(world_from_bev)
+        shown = prediction.boxes.shown(score).transformed(world_from_bev)
         futures = future_lines(shown, self._recorded.classes)
         log_ground_lines(self._stream, entities.FUTURES, futures, world_from_bev, cameras)
 

@@ -59,6 +59,7 @@ class Counts:
         seconds: by stage.
         whole: of whole frames.
         boxes: class -> number of boxes.
+        unseen: number of boxes that were left out, because no camera looks there.
         tracks: identity -> class; None without tracks.
         dropped: (frame, camera, reason) of each missing image.
         skipped: frames without any image.
@@ -71,6 +72,7 @@ class Counts:
     seconds: dict[str, RunningMedian] = field(default_factory=dict)
     whole: RunningMedian = field(default_factory=RunningMedian)
     boxes: dict[str, int] = field(default_factory=dict)
+    unseen: int = 0
     tracks: dict[str, str] | None = None
     dropped: list[tuple[int, str, str]] = field(default_factory=list)
     skipped: list[int] = field(default_factory=list)
@@ -103,9 +105,10 @@ class RunSummary:
         counts.whole.add(whole_s)
         for stage, seconds in {**prediction.stage_seconds, "recording": recording_s}.items():
             counts.seconds.setdefault(stage, RunningMedian()).add(seconds)
-        scores = prediction.boxes.scores
-        if scores is not None:
-            shown = prediction.boxes[scores >= self._options.recording.score]
+        if prediction.boxes.scores is not None:
+            score = self._options.recording.score
+            shown = prediction.boxes.shown(score)
+            counts.unseen += len(prediction.boxes.scored(score)) - len(shown)
             counts.boxes = dict(Counter(counts.boxes) + Counter(shown.classes.tolist()))
             if shown.instances is not None:
                 owners = zip(shown.instances.tolist(), shown.classes.tolist(), strict=True)
@@ -158,6 +161,7 @@ class RunSummary:
             "score": self._options.recording.score,
             "boxes": sum(counts.boxes.values()),
             "boxes_by_class": dict(counts.boxes),
+            "boxes_unseen": counts.unseen,
             "tracks": None if counts.tracks is None else len(counts.tracks),
             "tracks_by_class": dict(Counter((counts.tracks or {}).values())),
             "frames_per_second": self._rate(),
@@ -182,9 +186,13 @@ class RunSummary:
         counts = self.counts
         guessed = [f"{name} as {stand_in}" for name, stand_in in counts.embeddings.items() if name != stand_in]
         stages = ", ".join(f"{stage} {1000 * s.value():.0f} ms" for stage, s in counts.seconds.items())
+        unseen = f"; {counts.unseen} more where no camera looks (`--unseen` shows them)" if counts.unseen else ""
         rows = [
             ("frames", f"{self.frames} in {duration(counts.whole.total_s)}, {self._rate():.2f} per second"),
-            ("boxes", f"{sum(counts.boxes.values())} with a score of {self._options.recording.score:g} or more"),
+            (
+                "boxes",
+                f"{sum(counts.boxes.values())} with a score of {self._options.recording.score:g} or more{unseen}",
+            ),
             ("stages", f"{stages} (medians)"),
         ]
         if counts.tracks is not None:

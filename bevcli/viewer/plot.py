@@ -41,7 +41,7 @@ LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
 
 def plot(prediction: Prediction, image: str | None, score: float, color_order: ColorOrder) -> Canvas:
     """See `Prediction.plot`."""
-    frame, boxes = prediction.frame, prediction.boxes.scored(score)
+    frame, boxes = prediction.frame, prediction.boxes.shown(score)
     check_color_order(color_order)
     if frame is None:
         raise InputError("the prediction has no frame, whose images `plot` draws: predict it anew, or set `frame`")

@@ -210,7 +210,7 @@ def test_a_run_takes_the_models_identities_none_without_tracking(loaded, whole):
 
 
 def test_without_history_the_tracker_gives_identities(loaded):
-    for _, prediction in run_model(loaded, MemoryDrive(2), temporal=False):
+    for _, prediction in run_model(loaded, MemoryDrive(2), temporal=False, unseen=True):
         assert (prediction.boxes.instances != "").all()  # this tracker starts a track from every box
 
 

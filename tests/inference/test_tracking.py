@@ -61,6 +61,30 @@ def test_a_moving_object_keeps_its_identity():
     assert identities(moving(6)) == [["0"]] * 6
 
 
+def out_of_view(boxes, *unseen):
+    return replace(boxes, unseen=np.array(unseen))
+
+
+def test_a_box_where_no_camera_looks_starts_no_track():
+    seen, unseen = (out_of_view(frame(box(0, 0), box(9, 0)), False, hidden) for hidden in (False, True))
+    assert identities([unseen, unseen, seen]) == [["0", ""], ["0", ""], ["0", "1"]]
+
+
+def test_a_track_is_carried_out_of_view_for_some_seconds():
+    """Seen at 0 s; at 0.5 to 2 s within `carry_s`, at 2.5 s no more, and anew where a camera sees it again."""
+    hidden = [out_of_view(box(0, 0), unseen) for unseen in (False, True, True, True, True, True, False)]
+    carried = identities(hidden, config=TrackerConfig(carry_s=2.0))
+    assert carried == [["0"], ["0"], ["0"], ["0"], ["0"], [""], ["0"]]
+    assert [len(boxes.shown(0.5)) for boxes in track(hidden, TrackerConfig(carry_s=2.0))[0]] == [1, 1, 1, 1, 1, 0, 1]
+
+
+def test_a_box_in_view_is_no_duplicate_of_one_out_of_view():
+    better = out_of_view(frame(box(0, 0, score=0.9), box(0.5, 0, score=0.5)), True, False)
+    ((tracked,), _) = track([better])
+    assert tracked.duplicates.tolist() == [True, False]
+    assert tracked.instances.tolist() == ["", "0"]
+
+
 def test_crossing_objects_keep_their_identities_by_velocity():
     assert identities(crossing_cars()) == [["0", "1"]] * 7
     without = identities(crossing_cars(), config=TrackerConfig(use_velocity=False))

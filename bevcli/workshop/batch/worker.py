@@ -103,7 +103,7 @@ class Worker:
                 )
                 with run_in_folder(model, sequence, aside, job.run, source=shlex.quote(drive.source)) as running:
                     for _, prediction in running.frames:
-                        shown = prediction.boxes.scored(job.run.recording.score).scores
+                        shown = prediction.boxes.shown(job.run.recording.score).scores
                         if shown is not None:
                             histogram += np.histogram(shown, SCORE_BINS, (0, 1))[0]
                         yield
