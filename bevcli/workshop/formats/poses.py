@@ -29,63 +29,15 @@ from bevcli.sequences.native import TimeKind
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.oxts import read_oxts
 from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
+from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, TUM, VECTOR, Table, read_table
+from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
-VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
-MATRIX = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # world_from_camera, row by row
-TUM = ("time", *VECTOR, "qx", "qy", "qz", "qw")
-_UNIT = "(?:_(?:m|s|sec|seconds|ms|us|ns|deg|degrees|rad|radians))?"
-_OF = "(?:.*[._])?"  # such as field.pose.pose. in front of position.x
-# By quantity, the names of its column in lower case.
-NAMES = {
-    "time": rf"t|secs?|seconds|{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch){_UNIT}",
-    "seconds": rf"{_OF}secs?",
-    "nanoseconds": rf"{_OF}(?:nsecs?|nanosecs?)",
-    **{axis: rf"[pt]?_?{axis}(?:_m)?|p_\w+_{axis}|{_OF}(?:pos|pose|position|translation|location)[._]?{axis}(?:_m)?"
-       f"|{other}(?:ing)?(?:_m)?" for axis, other in zip(VECTOR, ("east", "north", "up"), strict=True)},
-    **{f"q{axis}": rf"q_?{axis}|q_\w+_{axis}|{_OF}(?:quat|quaternion|orientation|rotation|rot)[._]?{axis}"
-       for axis in "wxyz"},
-    "latitude": rf"{_OF}lat(?:itude)?{_UNIT}",
-    "longitude": rf"{_OF}(?:lon|lng|long|longitude){_UNIT}",
-    "altitude": rf"{_OF}(?:alt|altitude|elevation|ele|height){_UNIT}",
-    "roll": rf"{_OF}roll{_UNIT}",
-    "pitch": rf"{_OF}pitch{_UNIT}",
-    "yaw": rf"{_OF}yaw{_UNIT}",
-    "heading": rf"{_OF}(?:heading|course|azimuth|bearing){_UNIT}",
-}  # fmt: skip
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 FASTEST_M_S = 100.0
 COUNTER_CLOCKWISE, CLOCKWISE = "counter-clockwise from x", "clockwise from north"
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
-
-
-@dataclass(frozen=True)
-class Table:
-    """The cells of a file of poses.
-
-    Attributes:
-        path: the file.
-        columns: quantity -> name of its column in the file, "" where the file has no names; in the order of the file.
-        rows: cells by quantity.
-        separator: of the columns; None for spaces.
-    """
-
-    path: Path
-    columns: dict[str, str]
-    rows: list[CsvRow]
-    separator: str | None
-
-    def has(self, *names: str) -> bool:
-        """True where it has all of these quantities."""
-        return all(name in self.columns for name in names)
-
-    def numbers(self, *names: str) -> Array:
-        """(T, N) quantities; 0 where the table lacks one. Raises InputError that names line and column."""
-        there = [name in self.columns for name in names]
-        return np.array(
-            [[row.number(name) if has else 0.0 for name, has in zip(names, there, strict=True)] for row in self.rows]
-        )
 
 
 @dataclass(frozen=True)
@@ -123,8 +75,10 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     name = None if table is None else next((name for name, layout in KINDS.items() if layout.is_it(table)), None)
     if table is None or name is None:
         return None
+    table = in_usual_units(table, drive.stated)
     positions, origin = _positions(table)
     times, time_words = _times(table, positions, drive)
+    table = with_course(table, positions, times)
     for row, before, time in zip(table.rows[1:], times[:-1], times[1:], strict=True):
         if time <= before:
             raise InputError(f"{path}: line {row.line}: its time is not later than that of the row before: sort them")
@@ -134,7 +88,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
         readings = [candidate for reading in readings for candidate in of_vehicle(reading, camera)]
     best = best_reading(path, readings, times, ask, drive)
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
-    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, best.words, of)
+    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, *table.notes, best.words, of)
     note = f"poses: {', '.join(word for word in words if word)}"
     if drive.times_ns is not None:
         covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
@@ -143,61 +97,6 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     kinematics = derive_kinematics(times, best.translations, best.quaternions)
     poses = (times, best.translations, best.quaternions)
     return ReadPoses(EgoMotion(*poses, *kinematics, velocities_are_stated=False), (note,), origin)
-
-
-def read_table(path: Path) -> Table | None:
-    """The cells of a text file with columns; None where it has no rows, or not two columns that are known.
-
-    Names of columns stand in the line above the rows, which may be a comment. Raises InputError for a row with another
-    number of cells.
-    """
-    header, rows = "", list[tuple[int, str]]()
-    for number, line in enumerate(read_text(path, CSV_BYTES).removeprefix("\ufeff").splitlines(), 1):
-        text = line.strip()
-        if text.startswith(("#", "%")) or (not rows and re.match("[\"'A-Za-z_]", text)):
-            header = header if rows else text.lstrip("#% ").lower()
-        elif text:
-            rows.append((number, text))
-    if not rows:
-        return None
-    separator = next((sign for sign in (";", "\t", ",") if sign in rows[0][1]), None)
-    count = len(_cells(rows[0][1], separator))
-    names = _cells(header, separator)
-    names = names if len(names) == count else re.split(r"[,;\s]+", header)
-    places = _columns(path, names) if len(names) == count else {}
-    if len(places) < 2:
-        unnamed = {12: MATRIX, 8: TUM}.get(count, ())
-        if separator == "," and count in (8, 17):  # EuRoC's own order
-            unnamed = ("time", *VECTOR, *QUATERNION)
-        places, names = {quantity: index for index, quantity in enumerate(unnamed)}, [""] * count
-    if not places:
-        return None
-    table = Table(path, {quantity: names[index] for quantity, index in places.items()}, [], separator)
-    for number, text in rows:
-        cells = _cells(text.replace(",", ".") if separator in (";", "\t") else text, separator)
-        if len(cells) != count:
-            raise InputError(f"{path}: line {number} has {len(cells)} cells (expected {count}, as in the first row)")
-        table.rows.append(CsvRow(path, number, {quantity: cells[index] for quantity, index in places.items()}))
-    return table
-
-
-def _cells(text: str, separator: str | None) -> list[str]:
-    cells = [cell.strip().strip("\"'") for cell in text.split(separator)]
-    return cells[:-1] if cells and not cells[-1] else cells
-
-
-def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """The place of each known quantity. Raises InputError where two columns have the same."""
-    places: dict[str, int] = {}
-    for index, name in enumerate(names):
-        plain = re.sub(r"\s*[\[(].*", "", name)  # without the unit
-        quantity = next((quantity for quantity, pattern in NAMES.items() if re.fullmatch(pattern, plain)), None)
-        if quantity in places:
-            both = f'"{names[places[quantity]]}" and "{name}"'
-            raise InputError(f"{path}: the columns {both} are both {quantity}: remove one")
-        if quantity is not None:
-            places[quantity] = index
-    return places
 
 
 def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
