@@ -44,7 +44,7 @@ def run(
     score_without_labels: Annotated[
         bool,
         Option(
-            "Print the NDS that the boxes are likely to have, with an interval; the drive needs no ground truth.",
+            "Print how well the boxes agree with a detector in the images; the drive needs no ground truth.",
             "Output",
         ),
     ] = False,
@@ -103,8 +103,8 @@ def run(
     if score_without_labels:
         from bevcli.workshop.trust import estimate
 
-        faults = estimate.find_faults(loaded, drive)
-        say(estimate.estimate_of_run(loaded, out, drive.rig).with_faults(faults).table())
+        found = estimate.agreement_of_run(out, drive)
+        say(replace(found, findings=estimate.find_faults(loaded, drive)).table())
     if signals.received() and not summary.is_complete:
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)
         raise typer.Exit(signals.exit_code)

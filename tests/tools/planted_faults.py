@@ -205,7 +205,7 @@ ENGINE = {"engine": "openvino", "precision": "int8"}
 # Fault -> how to plant it into a model, and the findings of which one names it.
 MODEL_FAULTS = {
     "INT8 engine without its class head": (with_broken_engine, "engine-broken"),
-    # "weights with the image settings of another model": (of_another_model, "weights-broken"),
+    "weights with the image settings of another model": (of_another_model, "weights-broken"),
 }
 MOST_KEPT = 150  # features of images, and motions
 MILD = ("", "fog", "snow", "low_light", "motion_blur", "jpeg", "brightness", "impulse_noise")  # of sound drives

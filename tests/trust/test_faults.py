@@ -17,13 +17,13 @@ from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import CameraPoints, camera_findings, share
 from bevcli.workshop.trust.faults import (
-    ReversedColors,
-    agreement,
     find_faults,
     image_findings,
     input_faults,
     model_faults,
     one_cause,
+    repeated,
+    reversed_colors,
 )
 
 RIG: CameraRig = nuscenes_like_rig(512, 288)
@@ -158,25 +158,14 @@ def boxes(xs: list[float], names: list[str], scores: list[float] | None = None) 
 def test_boxes_agree_that_have_one_class_and_place():
     wanted = boxes([0, 10, 20, 30], ["car"] * 4, [0.9, 0.9, 0.9, 0.1])  # the last one is not counted
     given = boxes([1, 10, 23], ["car", "bus", "car"], [0.9, 0.9, 0.9])  # another class, and 3 m away
-    assert agreement([wanted], [given]) == (3, 1 / 3)
-
-
-class OneFrame(planted_faults.DerivedDrive):
-    """A drive of one frame with one image."""
-
-    def __init__(self, pixels: np.ndarray) -> None:
-        self.pixels, self.name, self.rig, self.stamps, self.has_ego_motion = pixels, "one", RIG, (), False
-
-    def load(self, index: int) -> planted_faults.Frame:
-        image = planted_faults.CameraImage(0, self.pixels)
-        return planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
+    assert repeated([wanted], [given]) == (3, 1 / 3)
 
 
 def test_colors_that_are_reversed_twice_are_the_same():
-    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    once = ReversedColors(OneFrame(pixels))
-    assert once.load(0).images["CAM_FRONT"].pixels_bgr[0, 0].tolist() == [2, 1, 0]
-    assert np.array_equal(ReversedColors(once).load(0).images["CAM_FRONT"].pixels_bgr, pixels)
+    image = planted_faults.CameraImage(0, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+    once = reversed_colors(planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None))
+    assert once.images["CAM_FRONT"].pixels_bgr[0, 0].tolist() == [2, 1, 0]
+    assert np.array_equal(reversed_colors(once).images["CAM_FRONT"].pixels_bgr, image.pixels_bgr)
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ def columns(classes: Iterable[str]) -> dict[str, pa.DataType]:
         **{f"boxes_{name}": pa.int64() for name in classes},
         **dict.fromkeys(("mean_ap", "nd_score", *ERRORS, *(f"iou_{name}" for name in MAP_CLASSES)), pa.float64()),
         "ground_truth_boxes": pa.int64(),
-        **dict.fromkeys(("estimated_nd_score", "estimated_low", "estimated_high"), pa.float64()),
+        **dict.fromkeys(("agreement", "agreement_low", "agreement_high"), pa.float64()),
         **dict.fromkeys(("not_scored", "input_errors"), pa.string()),
     }
 
@@ -252,8 +252,8 @@ def worst_drives(done: Sequence[Record]) -> tuple[list[Record], str]:
     if scored:
         return sorted(scored, key=lambda r: r["scores"]["mean_ap"])[:WORST], "lowest mAP over classes with ground truth"
     last, value = "mean score of the boxes", _mean_score
-    if all(r.get("estimated_nd_score") is not None for r in done):
-        last, value = "estimated NDS", lambda record: float(record["estimated_nd_score"])
+    if all(r.get("agreement") is not None for r in done):
+        last, value = "agreement", lambda record: float(record["agreement"])
     worst = sorted(done, key=lambda r: (-r["dropped_images"] - r["not_finite_frames"], value(r)))
     return worst[:WORST], f"no ground truth: most missing images and NaN frames, then lowest {last}"
 
@@ -275,10 +275,10 @@ def _worst(done: Sequence[Record]) -> str:
         problems = record["dropped_images"] + record["not_finite_frames"]
         link = f'<a href="{escape(path)}/recording.rrd">recording</a>'
         numbers = [_number(scores.get("mean_ap")), _number(scores.get("nd_score")), _number(scores.get("trans_err"))]
-        numbers.append(_number(record.get("estimated_nd_score")))
+        numbers.append(_number(record.get("agreement")))
         row = [escape(record["drive"]), *numbers, f"{_mean_score(record):.2f}", str(problems), str(record["frames"])]
         rows.append((*row, f"{link} <code>bevcli viz {escape(path)}</code>"))
-    head = ("drive", "mAP", "NDS", "ATE m", "estimated NDS", "mean score", "missing images, NaN", "frames", "")
+    head = ("drive", "mAP", "NDS", "ATE m", "agreement", "mean score", "missing images, NaN", "frames", "")
     table = _table(head, rows, range(1, 8))
     return f'<h2>Worst drives</h2><p class="soft">{meaning}</p>{table}'
 

@@ -39,7 +39,7 @@ from bevcli.workshop.batch import Workers, ray_is_installed, storage
 from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
 from bevcli.workshop.scores.evaluate import Scores, evaluate
-from bevcli.workshop.trust.estimate import estimate_of_run, fits
+from bevcli.workshop.trust.estimate import agreement_of_run
 
 _SCRATCH = "bevcli-batch-"
 
@@ -124,7 +124,7 @@ class Worker:
                 "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
-                **self._estimated(sequence, aside),
+                **_agreement_columns(sequence, aside),
                 "input_errors": "; ".join(summary.input_errors),
             }
             _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")
@@ -152,14 +152,6 @@ class Worker:
         matches = DriveMatches(detection.frame_count, detection.matches, detection.unmeasured, scores.segmentation)
         save_state(aside / MATCHES, matches)
         return scores, ""
-
-    def _estimated(self, sequence: Drive, aside: Path) -> Record:
-        """The columns of the score that is estimated without ground truth; empty for weights without a fit."""
-        if self._model.weights_hash not in fits():
-            return {}
-        estimated = estimate_of_run(self._model, aside, sequence.rig)
-        values = {"nd_score": estimated.nd_score, "low": estimated.low, "high": estimated.high}
-        return {f"estimated_{name}": None if value is None else round(value, 4) for name, value in values.items()}
 
     @contextlib.contextmanager
     def _scratch(self, result: str) -> Iterator[tuple[Path, Path]]:
@@ -213,6 +205,13 @@ def _score_columns(scores: Scores) -> Record:
         numbers |= {f"iou_{name}": value for name, value in scores.segmentation.iou.items()}
     defined = {name: None if np.isnan(value) else round(value, 6) for name, value in numbers.items()}
     return {**defined, "ground_truth_boxes": scores.detection.overall.ground_truth_count}
+
+
+def _agreement_columns(sequence: Drive, aside: Path) -> Record:
+    """The agreement of the boxes with the witness, which needs no ground truth."""
+    found = agreement_of_run(aside, sequence)
+    values = {"agreement": found.score, "agreement_low": found.low, "agreement_high": found.high}
+    return {name: None if value is None else round(value, 4) for name, value in values.items()}
 
 
 def _fetched(drive: BatchDrive, job: Job, inputs: Path) -> Path:

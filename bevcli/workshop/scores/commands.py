@@ -8,6 +8,7 @@ import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
 from bevcli.printing import print_note, say
+from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.scores.options import EvaluationOptions, ResultOptions
 
@@ -22,7 +23,8 @@ def evaluate(
         ),
     ],
     ground_truth: Annotated[
-        Path, argument("ground_truth.json, a sequence folder that contains one, or a nuScenes root.")
+        Path,
+        argument("ground_truth.json, a sequence folder, a nuScenes root, or a drive without labels."),
     ],
     source: Annotated[InputOptions, Part(only=("scene", "class_map"))],
     format_options: Annotated[FormatValues, Part(only=("version", "split"))],
@@ -35,9 +37,17 @@ def evaluate(
     Frames are matched by nuScenes' sample token, else by scene and timestamp, else by frame index. `bevcli validate`
     runs a model on several drives and scores them together.
 
+    A drive without ground truth: the boxes are compared with what a detector sees in its images.
+
     With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
     frames.
     """
+    if len(predictions) == 1 and _is_unlabelled(ground_truth):
+        further = {**vars(options), **vars(results), "worst": None}
+        if given := [name for name, value in further.items() if value]:
+            raise InputError(f"--{given[0].replace('_', '-')}: {ground_truth} has no ground truth: remove it")
+        _print_agreement(predictions[0], ground_truth, source, results.worst or 0, format_options, as_json=as_json)
+        return
     if len(predictions) > 2:
         raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
     score: Any = bevcli.evaluate if len(predictions) == 1 else bevcli.compare
@@ -57,3 +67,26 @@ def evaluate(
     if options.plot is not None:
         for path in scores.write_plots(options.plot):
             say(f"wrote {path}", err=True)
+
+
+def _is_unlabelled(path: Path) -> bool:
+    """Whether a path is a drive without labels; of a format that has labels, the reading of them tells."""
+    return is_drive(path) and not format_of(path).annotated and not (path / "ground_truth.json").exists()
+
+
+def _print_agreement(
+    predictions: Path,
+    path: Path,
+    source: InputOptions,
+    worst: int,
+    format_options: FormatValues,
+    *,
+    as_json: bool,
+) -> None:
+    """Print how well boxes agree with a detector in the images of a drive without ground truth."""
+    from bevcli.workshop.scores.inputs import open_predictions
+    from bevcli.workshop.trust.estimate import agreement_of_boxes, as_document
+
+    file, drive = open_predictions(predictions, source.class_map), bevcli.open_sequence(path, source, **format_options)
+    found = agreement_of_boxes(file.boxes, drive, file.range_m, worst=worst)
+    say(json.dumps(as_document(found, [(drive.name, found)]), indent=1) if as_json else found.table())

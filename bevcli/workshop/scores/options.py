@@ -40,8 +40,8 @@ class ResultOptions:
     )
     worst: int | None = option(
         default=None,
-        help="List the N frames with most missed and most invented boxes. Default: none for one file of predictions, "
-        "3 for two.",
+        help="List the N frames with most missed and most invented boxes, without ground truth those that differ most "
+        "from the detector. Default: none for one file of predictions, 3 for two.",
         metavar="N",
         minimum=1,
     )

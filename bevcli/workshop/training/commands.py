@@ -112,11 +112,11 @@ def validate(
     options: ValidationOptions,
     as_json: Json = False,
 ) -> None:
-    """Score a model on drives with ground truth, all drives together; estimate the score of drives without.
+    """Score a model on drives with ground truth, all drives together; hold its boxes against a detector without.
 
     Each drive is run as by `bevcli run` and scored as by `bevcli eval`, which scores the files of a run that is done.
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
-    Where no drive has ground truth, the NDS of each is estimated from its boxes, with an interval.
+    Where no drive has ground truth, the boxes are compared with what a detector sees in the images.
     """
     from bevcli.workshop.training import train as work, validation
 
@@ -152,26 +152,29 @@ def _estimate(
     as_json: bool,
     temporal: bool,
 ) -> None:
-    """Print the estimated score of each drive; none of them has ground truth.
+    """Print the agreement of each drive with the witness; none of them has ground truth.
 
     drives: with those of a reference as the second item. frames: of all of them. why: notes on the model.
     """
-    from bevcli.workshop.trust.estimate import EstimatedScore, as_document, estimate_score
+    from bevcli.workshop.trust.agreement import agreement
+    from bevcli.workshop.trust.estimate import as_document, frames_of_model
+    from bevcli.workshop.trust.faults import find_faults
 
     for name, is_set in (("--max-range", options.max_range is not None), ("--tracking", options.tracking)):
         if is_set:
             raise InputError(f"{name}: needs ground truth, which no drive has: remove it")
-    scores: list[tuple[str, EstimatedScore]] = []
-    notes = (
-        *why,
-        "no drive has ground truth: the score is estimated from the boxes (docs/trust.md)",
-    )
+    notes = (*why, "no drive has ground truth: the boxes are held against a detector in the images (docs/trust.md)")
+    found = []
     with Progress(frames, "frames", notes) as progress:
         for drive in (some.open(index) for some in drives for index in range(len(some))):
-            score = estimate_score(model, drive, temporal=temporal, after_frame=progress.advance)
-            scores.append((drive.name, score))
-    reference = None if options.reference is None else scores.pop()[1]
+            parts = frames_of_model(model, drive, temporal=temporal, after_frame=progress.advance)
+            found.append((drive.name, parts, replace(agreement(parts), findings=find_faults(model, drive))))
+    reference = None if options.reference is None else found.pop()[2]
+    scores = [(name, score) for name, _, score in found]
+    together = agreement([frame for _, parts, _ in found for frame in parts])
     if as_json:
-        say(json.dumps(as_document(scores, reference), indent=1))
+        say(json.dumps(as_document(together, scores, reference), indent=1))
         return
+    if len(scores) > 1:
+        say(f"all drives\n{together.table(reference)}\n")
     say("\n\n".join(f"drive  {name}\n{score.table(reference)}" for name, score in scores))

@@ -102,7 +102,7 @@ class ValidationOptions:
     reference: Path | None = option(
         reads="path",
         default=None,
-        help="Where no drive has ground truth: a drive on which the weights are known to work. Its figures are printed "
-        "beside those of each drive.",
+        help="Where no drive has ground truth: a drive on which the weights are known to work. Its agreement is "
+        "printed beside that of each drive.",
         metavar="DIR",
     )

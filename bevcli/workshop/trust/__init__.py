@@ -1,9 +1,10 @@
-"""Does it work on my cameras: a score without labels, and faults that show without them.
+"""Does it work on my cameras: agreement with a second witness, and faults that show without labels.
 
 In the order of the work:
-    figures       numbers of a run's boxes that need no labels
-    fit, fits/    how the figures of known weights go with their true NDS
-    estimate      the entry point: the estimated score of a drive, or of the files of a run
+    witness       a detector in the images, which knows nothing of the model
+    sightings     projected boxes and those that it sees, and which are partners
+    agreement     the score, its parts and its interval
+    estimate      the entry point: the agreement of a model, a run or a file
     camera_faults faults of single cameras, by how points move in their images
     faults        all faults that show without labels
 """

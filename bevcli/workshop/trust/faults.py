@@ -1,10 +1,11 @@
-"""`find_faults`: mistakes in the input, and broken engines, that show without labels. One line each.
+"""`find_faults`: mistakes in the input, and broken weights or engines, that show without labels. One line each.
 
 In this order: cameras that are dead or frozen, by their pixels; single cameras and poses, by how points move in the
-images; the order of colours, by the model's scores with the order reversed; an engine, by the boxes of PyTorch.
+images; the order of colours, by what the witness sees with the order reversed; an engine, by the boxes of PyTorch;
+weights, by what the witness sees.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.findings import Finding, errors_of
-from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
+from bevcli.frame import CameraImage, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.transforms import Array
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
@@ -24,8 +26,9 @@ from bevcli.sequences.view import select
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.views import Viewer
+from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
-from bevcli.workshop.trust.figures import figures_of
+from bevcli.workshop.trust.witness import load_witness
 
 STEPS = 6  # between frames whose images are compared
 POSE_STEPS = 4  # between frames whose motion is measured
@@ -35,14 +38,13 @@ FLAT = 2.0  # grey levels: standard deviation of an image that shows something
 STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
 SURE, REPEATED_M = 0.3, 2.0  # boxes that are looked for: score, error
 LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
-BETTER = 0.015  # confidence, that the right order of colours gains; the wrong one loses 0.03 to 0.11
+BETTER, LEAST_GAIN = 1.1, 1.0  # how much more the witness must see in the other order of colours: factor, scores
+LEAST_FOUND = 0.1  # share of what the witness sees that sound weights find
 
 
-class ReversedColors(DerivedDrive):
-    """A drive whose images have their colour channels in reverse order."""
-
-    def change(self, index: int, frame: Frame) -> Frame:
-        return replace(frame, images={name: _reversed(image) for name, image in frame.images.items()})
+def reversed_colors(frame: Frame) -> Frame:
+    """The frame with the colour channels of its images in reverse order."""
+    return replace(frame, images={name: _reversed(image) for name, image in frame.images.items()})
 
 
 def _reversed(image: CameraImage) -> CameraImage:
@@ -124,11 +126,14 @@ def image_findings(names: Iterable[str], frames: Sequence[dict[str, Array]]) -> 
 
 
 def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
-    """Faults that show in the boxes of a few frames: colours in the wrong order, or a broken engine."""
+    """Faults that show in the boxes of a few frames: colours in the wrong order, a broken engine or broken weights."""
     first = max(0, (len(drive.stamps) - TRIED) // 2)
     some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
     boxes = frame_boxes(model, some)
-    return (*color_findings(model, some, boxes), *engine_findings(model, some, boxes))
+    frames = [some.load(place) for place in range(len(some.stamps))]
+    seen = [load_witness().seen(frame) for frame in frames]
+    broken = engine_findings(model, some, boxes) or weights_findings(model, frames, boxes, seen)
+    return (*color_findings(frames, seen), *broken)
 
 
 def frame_boxes(
@@ -142,14 +147,16 @@ def frame_boxes(
     return frames
 
 
-def color_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
-    """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
-    range_m = model.config.bev_grid.nearest_side_m
-    reversed_boxes = frame_boxes(model, ReversedColors(drive))
-    stated, undone = (figures_of(each, drive.rig, range_m).confidence for each in (boxes, reversed_boxes))
-    if not undone - stated >= BETTER:
+def color_findings(frames: Sequence[Frame], seen: Sequence[Mapping[str, Boxes2D]]) -> tuple[Finding, ...]:
+    """The finding about images whose colour channels are in the wrong order. seen: by the witness, as they are."""
+    undone = [load_witness().seen(reversed_colors(frame)) for frame in frames]
+    before, after = (
+        sum(float(boxes.scored(SURE).scores.sum()) for cameras in side for boxes in cameras.values())
+        for side in (seen, undone)
+    )
+    if not after >= max(BETTER * before, before + LEAST_GAIN):
         return ()
-    found = f"mean of the 15 best scores {stated:.2f} as they are, {undone:.2f} with red and blue exchanged"
+    found = f"scores of what a detector sees: {before:.1f} as they are, {after:.1f} with red and blue exchanged"
     message, advice = "red and blue are exchanged in the images", "state the order of the channels, or exchange them"
     return (Finding("color-order", "error", None, message, found, "", advice),)
 
@@ -159,7 +166,7 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> 
     if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
         return ()
     plain = frame_boxes(replace(model, engine=TORCH, precision="fp32"), drive)
-    count, same = agreement([each.boxes for each in plain], [each.boxes for each in boxes])
+    count, same = repeated([each.boxes for each in plain], [each.boxes for each in boxes])
     if count == 0 or same >= LEAST_SAME:
         return ()
     message = f"{model.engine} with {model.precision} does not give the boxes of PyTorch"
@@ -168,7 +175,25 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> 
     return (Finding("engine-broken", "error", None, message, found, expected, advice),)
 
 
-def agreement(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, float]:
+def weights_findings(
+    model: Model, frames: Sequence[Frame], boxes: Sequence[FrameBoxes], seen: Sequence[Mapping[str, Boxes2D]]
+) -> tuple[Finding, ...]:
+    """The finding about weights that find little of what the witness sees."""
+    rows = zip(frames, boxes, seen, strict=True)
+    in_world = [(one, of.boxes.transformed(one.world_from_ego.matrix), sees) for one, of, sees in rows]
+    range_m = model.config.bev_grid.nearest_side_m
+    parts = agreement(list(compared(in_world, model.config.object_classes, range_m, has_poses=False))).groups.values()
+    objects = sum(part.objects for part in parts)
+    share = sum(part.found * part.objects for part in parts if part.objects) / max(objects, 1)
+    if objects < FEWEST_OBJECTS or share >= LEAST_FOUND:
+        return ()
+    message = "the model finds little of what a detector sees in the images"
+    found, expected = f"{share:.0%} of {objects} objects", f"{LEAST_FOUND:.0%} or more"
+    advice = "take weights and model file of one training, check the engine, or use weights that know such images"
+    return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
+
+
+def repeated(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, float]:
     """Number of boxes with a score of 0.3 or more, or without one, and the share of them that others repeat.
 
     A box is repeated by one of its class that is at most 2 m away and has a score of 0.15 or more.

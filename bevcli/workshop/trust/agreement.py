@@ -1,0 +1,282 @@
+"""Agreement: how well boxes in space and the boxes of the witness in the images explain each other.
+
+The score is the harmonic mean of how much the objects of the witness and the boxes of the model overlap with their
+partners, times (1 + 2 kept) / 3. Without frames that follow each other, kept counts as 0.5.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from bevcli.findings import Finding
+from bevcli.frame import Frame, FrameStamp
+from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
+from bevcli.geometry.transforms import Array
+from bevcli.printing import aligned, number
+from bevcli.workshop.scores.evaluate import finite
+from bevcli.workshop.trust.sightings import GROUPS, NOTHING, Sightings, sightings
+
+PARTNER = 0.3  # overlap from which on two boxes explain each other
+NEAR_M, MARGIN_M = 2.0, 4.0  # a box is kept within this distance of where it is expected; it may leave the range
+RESAMPLES, ENDS = 1000, (5, 95)  # of the seconds; percentiles of the interval
+FEWEST_SECONDS, FEWEST_OBJECTS = 3, 20  # for an interval; for a score without a note
+RINGS_M = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0)
+# What whoever reads a score may hold it against; docs/trust.md says on which drives.
+USUAL = "demo 0.3 to 0.4 on rendered streets, photographs 0.25 to 0.4 on photographs, labels 0.5 to 0.65"
+
+
+@dataclass(frozen=True)
+class FrameAgreement:
+    """One frame: what is projected and seen in its images, within the range; and how many boxes are kept.
+
+    Attributes:
+        stamp: of the frame.
+        ours: the projected boxes that are held against the witness, and those that explain one of its objects.
+        theirs: the same of the witness.
+        kept: sums over the boxes: of scores that the next frame keeps, and of scores; zeros where none follows.
+        is_looked_at: whether the witness saw the frame.
+    """
+
+    stamp: FrameStamp
+    ours: Sightings
+    theirs: Sightings
+    kept: tuple[float, float] = (0.0, 0.0)
+    is_looked_at: bool = False
+
+    @property
+    def differences(self) -> int:
+        """Number of objects and of boxes without a partner."""
+        return int(sum((side.overlaps[side.counted] < PARTNER).sum() for side in (self.ours, self.theirs)))
+
+
+@dataclass(frozen=True)
+class Part:
+    """Agreement of a group, a camera or a ring of distances.
+
+    Attributes:
+        found: share of the witness's objects that a projected box explains; NaN without any.
+        confirmed: share of the boxes in view that the witness explains; NaN without any.
+        objects: number of the witness's.
+        boxes: number of the boxes in view.
+    """
+
+    found: float
+    confirmed: float
+    objects: int
+    boxes: int
+
+
+@dataclass(frozen=True)
+class Shift:
+    """The median offset in a camera from projected boxes to seen ones; NaN without pairs.
+
+    Attributes:
+        right_px: pixels.
+        down_px: pixels.
+        scale: height of a seen box as a share of the projected one's.
+        pairs: number of them.
+    """
+
+    right_px: float
+    down_px: float
+    scale: float
+    pairs: int
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of the boxes of one or several drives with the witness.
+
+    Attributes:
+        score: 0 to 1; None where the witness sees nothing.
+        low: lower end of the interval of 90 % over resamplings of the seconds; None for fewer than three seconds.
+        high: its upper end.
+        kept: share of the boxes that the next frame has where motion leads, each counted by its score; NaN unknown.
+        groups: "vehicles", "people" and "cycles" -> their agreement.
+        cameras: camera -> agreement of what it shows.
+        distances: "0-10 m" and so on -> agreement of what is at this distance from the vehicle, on flat ground.
+        shifts: camera -> offset between projected and seen boxes.
+        frames: number of frames, and how many of them the witness saw.
+        worst: the frames that differ most, with the number of objects and boxes without a partner.
+        findings: faults that show without labels.
+        notes: why there is no score, or why it says little.
+    """
+
+    score: float | None
+    low: float | None
+    high: float | None
+    kept: float
+    groups: Mapping[str, Part]
+    cameras: Mapping[str, Part]
+    distances: Mapping[str, Part]
+    shifts: Mapping[str, Shift]
+    frames: tuple[int, int]
+    worst: tuple[tuple[FrameStamp, int], ...] = ()
+    findings: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON; numbers that are not known are null."""
+        worst = [{"frame": one.index, "scene": one.scene, "differences": count} for one, count in self.worst]
+        content = {**asdict(self), "frames": self.frames[0], "looked_at": self.frames[1], "worst_frames": worst}
+        return dict(finite({key: value for key, value in content.items() if key != "worst"}))
+
+    @property
+    def line(self) -> str:
+        """The score on one line."""
+        if self.score is None:
+            return "agreement -"
+        between = "" if self.low is None else f", between {self.low:.2f} and {self.high:.2f} over its seconds"
+        return f"agreement {self.score:.2f}{between} (usual: {USUAL})"
+
+    def table(self, reference: "Agreement | None" = None) -> str:
+        """The score and its parts as text. reference: of another drive, whose numbers stand beside."""
+        sides = [self] if reference is None else [self, reference]
+        lines = [self.line] if reference is None else [self.line, f"reference {reference.line}"]
+        kept = [number(side.kept, 2) for side in sides]
+        lines.append(f"kept {' '.join(kept[:1])}{f' (reference {kept[1]})' if len(kept) > 1 else ''}")
+        rows = ["\n".join(lines)]
+        for title in ("groups", "cameras", "distances"):
+            cells = [(title, *("found", "of objects", "confirmed", "of boxes") * len(sides))]
+            tables: list[Mapping[str, Part]] = [getattr(side, title) for side in sides]
+            for name in tables[0]:
+                parts = [table.get(name, Part(np.nan, np.nan, 0, 0)) for table in tables]
+                cells.append((name, *(cell for part in parts for cell in _cells(part))))
+            rows.append(aligned(cells))
+        shifts = [("shift of what is seen", "right px", "down px", "scale", "pairs")]
+        shifts += [
+            (name, number(each.right_px, 1), number(each.down_px, 1), number(each.scale, 2), str(each.pairs))
+            for name, each in self.shifts.items()
+        ]
+        rows.append(aligned(shifts))
+        if self.worst:
+            head = ("worst frames", "objects and boxes without a partner")
+            rows.append(aligned([head, *((f"frame {stamp.index}", str(count)) for stamp, count in self.worst)]))
+        notes = [f"note: {note}" for note in self.notes]
+        found = [f"{finding.severity}: {finding.line}" for finding in self.findings]
+        return "\n\n".join([*rows, *filter(None, ["\n".join([*notes, *found])])])
+
+
+def _cells(part: Part) -> tuple[str, ...]:
+    return number(part.found, 2), str(part.objects), number(part.confirmed, 2), str(part.boxes)
+
+
+def compared(
+    frames: Iterable[tuple[Frame, Boxes3D, Mapping[str, Boxes2D] | None]],
+    classes: Mapping[str, ObjectClass],
+    range_m: float,
+    *,
+    has_poses: bool,
+) -> Iterator[FrameAgreement]:
+    """Each frame's boxes held against what the witness sees, and against the boxes of the next frame.
+
+    frames: with the boxes of each in the world frame, and what the witness sees, None where it did not look. classes:
+    of the boxes. range_m: nothing beyond this distance is counted. has_poses: whether the drive has ego-motion.
+    """
+    before: tuple[FrameAgreement, Boxes3D, Array] | None = None
+    for frame, boxes, seen in frames:
+        shown = boxes.scored(SHOWN_SCORE)
+        sides = (NOTHING, NOTHING) if seen is None else sightings(frame, shown, seen, classes)
+        ours, theirs = (replace(side, counted=side.counted & (side.distances < range_m)) for side in sides)
+        now = FrameAgreement(frame.stamp, ours, theirs, is_looked_at=seen is not None)
+        if before is not None:
+            last, own, place = before
+            follows = has_poses and last.stamp.scene == frame.stamp.scene
+            seconds = (frame.stamp.timestamp_ns - last.stamp.timestamp_ns) / 1e9
+            near = own[np.linalg.norm(own.centers - place, axis=1) < range_m - MARGIN_M]
+            yield replace(last, kept=kept(near, shown, seconds)) if follows else last
+        before = now, shown, frame.world_from_ego.matrix[:3, 3]
+    if before is not None:
+        yield before[0]
+
+
+def kept(boxes: Boxes3D, following: Boxes3D, seconds: float) -> tuple[float, float]:
+    """Sums of the scores of boxes that the next frame keeps, and of all of them.
+
+    A box that is off by v m/s from where its velocity leads counts exp(-v / 2), one that is off by 2 m not at all. All
+    boxes are in the world frame.
+    """
+    scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
+    if not len(boxes) or not len(following):
+        return 0.0, float(scores.sum())
+    there = boxes.centers[:, :2] + np.nan_to_num(boxes.velocities) * seconds
+    off_m = np.linalg.norm(there[:, None] - following.centers[:, :2], axis=2)
+    off_m[boxes.classes[:, None] != following.classes] = np.inf
+    nearest = off_m.min(axis=1)
+    return float(scores @ np.where(nearest < NEAR_M, np.exp(-nearest / seconds / 2), 0)), float(scores.sum())
+
+
+def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
+    """The agreement of all frames. worst: length of the list of frames that differ most."""
+    looked = [frame for frame in frames if frame.is_looked_at]
+    ours, theirs = (
+        Sightings.concatenate([NOTHING, *(side[side.counted] for side in sides)])
+        for sides in ([frame.ours for frame in looked], [frame.theirs for frame in looked])
+    )
+    seconds = np.array([_sums(frame) for frame in frames]).reshape(-1, 6)
+    blocks = [f"{frame.stamp.scene} {frame.stamp.timestamp_ns // 10**9}" for frame in frames]
+    names, block = np.unique(blocks, return_inverse=True)
+    sums = np.zeros((len(names), 6))
+    np.add.at(sums, block, seconds)
+    total = sums.sum(axis=0)
+    score = low = high = None
+    if len(theirs):
+        score = float(_score(total))
+        if len(sums) >= FEWEST_SECONDS:
+            draws = np.random.default_rng(0).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
+            low, high = (float(end) for end in np.percentile(_score(draws @ sums), ENDS))
+    order = sorted(looked, key=lambda frame: -frame.differences)[:worst]
+    cameras = dict.fromkeys([*theirs.cameras.tolist(), *ours.cameras.tolist()])
+    pairs = Sightings.concatenate([NOTHING, *(frame.ours[frame.ours.overlaps >= PARTNER] for frame in looked)])
+    rings = {
+        f"{a:g}-{b:g} m": _part(*(side[(a <= side.distances) & (side.distances < b)] for side in (theirs, ours)))
+        for a, b in pairwise(RINGS_M)
+    }
+    return Agreement(
+        *(score, low, high, float(total[4] / total[5]) if total[5] else np.nan),
+        {name: _part(*(side[side.groups == index] for side in (theirs, ours))) for index, name in enumerate(GROUPS)},
+        {name: _part(*(side[side.cameras == name] for side in (theirs, ours))) for name in cameras},
+        {name: part for name, part in rings.items() if part.objects or part.boxes},
+        {name: _shift(pairs[pairs.cameras == name]) for name in cameras},
+        (len(frames), len(looked)),
+        tuple((frame.stamp, frame.differences) for frame in order if frame.differences),
+        notes=tuple(_notes(len(theirs))),
+    )
+
+
+def _notes(objects: int) -> Iterator[str]:
+    if not objects:
+        yield "the witness sees no vehicle, person or cycle near the vehicle: night, fog or an empty road tell nothing"
+    elif objects < FEWEST_OBJECTS:
+        yield f"the witness sees {objects} objects only (expected {FEWEST_OBJECTS} or more): the score says little"
+
+
+def _sums(frame: FrameAgreement) -> tuple[float, ...]:
+    """Of the objects and of the boxes the overlaps and their number, then `kept`."""
+    sides = (side.overlaps[side.counted] for side in (frame.theirs, frame.ours))
+    return (*(value for each in sides for value in (float(each.sum()), len(each))), *frame.kept)
+
+
+def _score(sums: Array) -> Array:
+    """(...,) of sums (..., 6)."""
+    found, confirmed, same = (sums[..., i] / np.maximum(sums[..., i + 1], 1e-9) for i in (0, 2, 4))
+    same = np.where(sums[..., 5] > 0, same, 0.5)
+    return np.asarray(2 * found * confirmed / np.maximum(found + confirmed, 1e-9) * (1 + 2 * same) / 3)
+
+
+def _part(theirs: Sightings, ours: Sightings) -> Part:
+    found, confirmed = (float((side.overlaps >= PARTNER).mean()) if len(side) else np.nan for side in (theirs, ours))
+    return Part(found, confirmed, len(theirs), len(ours))
+
+
+def _shift(pairs: Sightings) -> Shift:
+    if not len(pairs):
+        return Shift(np.nan, np.nan, np.nan, 0)
+    right, down = np.median((pairs.partners - pairs.corners).reshape(-1, 2, 2).mean(axis=1), axis=0)
+    own, seen = ((side[:, 3] - side[:, 1]) for side in (pairs.corners, pairs.partners))
+    return Shift(float(right), float(down), float(np.median(seen / own)), len(pairs))

@@ -1,0 +1,175 @@
+"""Boxes held against what the witness sees: projected boxes and seen ones of each image, and which are partners."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from bevcli.frame import Frame
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.cameras import Camera
+from bevcli.geometry.object_classes import ObjectClass
+from bevcli.geometry.transforms import Array, apply, inverse
+
+GROUPS = ("vehicles", "people", "cycles")
+_OF_COCO = {"car": 0, "truck": 0, "bus": 0, "person": 1, "bicycle": 2, "motorcycle": 2}
+_OF_KIND = {"vehicle": 0, "pedestrian": 1, "cycle": 2}  # of the attributes of a class of objects
+SURE, POSSIBLE = 0.4, 0.2  # scores of the witness: of an object, and of one that may confirm a box
+LEAST_PX = 16.0  # height of an object in an image
+EDGE_PX = 2.0  # a seen box that ends this near the edge of the image may go on outside
+IN_VIEW = 0.7  # share of a projected box that lies in the image
+HIDDEN, NEARER_M = 0.5, 1.0  # share of a projected box that one covers which is nearer by this
+RIDER = 0.2  # overlap of a person and a cycle from which on the person rides it
+DOUBLE = 0.6  # overlap of two seen boxes of a group, such as a car and a truck, that are one object
+POINTS = np.linspace(0, 1, 5)  # of an edge of a box, which a lens bends
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """N projected boxes of a model, or N boxes that the witness sees.
+
+    Attributes:
+        frames: (N,) index of the frame.
+        cameras: (N,) names.
+        corners: (N, 4) x0, y0, x1, y1 in the image, pixels.
+        groups: (N,) index into GROUPS.
+        distances: (N,) to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon.
+        scores: (N,) 0 to 1.
+        counted: (N,) whether it is held against the other side: whole in the image, large enough, and not hidden.
+        overlaps: (N,) intersection over union with the partner; 0 without one.
+        partners: (N, 4) corners of the partner; NaN without one.
+    """
+
+    frames: NDArray[np.int64]
+    cameras: NDArray[np.str_]
+    corners: Array
+    groups: NDArray[np.int64]
+    distances: Array
+    scores: Array
+    counted: NDArray[np.bool_]
+    overlaps: Array
+    partners: Array
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> "Sightings":
+        return Sightings(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @staticmethod
+    def concatenate(parts: Sequence["Sightings"]) -> "Sightings":
+        """All of the parts, of which there is at least one."""
+        columns = ([getattr(part, field.name) for part in parts] for field in fields(Sightings))
+        return Sightings(*map(np.concatenate, columns))
+
+
+def group_of(name: str, classes: Mapping[str, ObjectClass]) -> int:
+    """Index into GROUPS; -1 for a class that the witness does not know."""
+    return _OF_KIND.get(classes[name].attributes[0].partition(".")[0], -1) if name in classes else -1
+
+
+def projected(boxes: Boxes3D, camera_from_boxes: Array, camera: Camera) -> Array:
+    """(N, 4) the rectangles around boxes in the image, not cut at its edges; NaN for what is partly behind the camera.
+
+    camera_from_boxes: (4, 4), metres.
+    """
+    edges = boxes.corners()[:, np.array(BOX_EDGES)]  # (N, 12, 2, 3)
+    points = edges[:, :, :1] * (1 - POINTS[:, None]) + edges[:, :, 1:] * POINTS[:, None]
+    pixels, _ = camera.project(apply(camera_from_boxes, points.reshape(len(boxes), len(BOX_EDGES) * len(POINTS), 3)))
+    return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
+
+
+def overlaps(a: Array, b: Array) -> Array:
+    """(N, M) intersection over union of rectangles (N, 4) and (M, 4); 0 where one is NaN."""
+    shared, own = intersections(a, b), [areas(each) for each in (a, b)]
+    return np.nan_to_num(shared / np.maximum(own[0][:, None] + own[1] - shared, 1e-9))
+
+
+def intersections(a: Array, b: Array) -> Array:
+    """(N, M) areas that rectangles (N, 4) and (M, 4) share."""
+    size = np.minimum(a[:, None, 2:], b[:, 2:]) - np.maximum(a[:, None, :2], b[:, :2])
+    return np.asarray(np.maximum(size, 0).prod(axis=-1))
+
+
+def areas(corners: Array) -> Array:
+    """(N,) areas of rectangles."""
+    return np.asarray(np.maximum(corners[:, 2:] - corners[:, :2], 0).prod(axis=1))
+
+
+def sightings(
+    frame: Frame, boxes: Boxes3D, seen: Mapping[str, Boxes2D], classes: Mapping[str, ObjectClass]
+) -> tuple[Sightings, Sightings]:
+    """What is projected, and what is seen, in all images of a frame.
+
+    boxes: those that are shown, world frame. seen: of the witness. classes: of the boxes, by name.
+    """
+    groups = np.array([group_of(name, classes) for name in boxes.classes.tolist()], dtype=int)
+    boxes, groups = boxes[groups >= 0], groups[groups >= 0]
+    cameras = [camera for camera in frame.rig.cameras if camera.name in seen]
+    pairs = [_of_camera(frame, camera, boxes, groups, seen[camera.name]) for camera in cameras]
+    ours, theirs = zip((NOTHING, NOTHING), *pairs, strict=True)
+    return Sightings.concatenate(ours), Sightings.concatenate(theirs)
+
+
+def _of_camera(
+    frame: Frame, camera: Camera, boxes: Boxes3D, groups: NDArray[np.int64], seen: Boxes2D
+) -> tuple[Sightings, Sightings]:
+    pose, size = frame.world_from_ego_at[camera.name].matrix, np.array([camera.width, camera.height])
+    whole = projected(boxes, inverse(pose @ camera.ego_from_camera), camera)
+    inside = np.clip(whole, -0.5, np.tile(size, 2) - 0.5)
+    kept = areas(inside) > 0  # False for NaN
+    boxes, groups, whole, inside = boxes[kept], groups[kept], whole[kept], inside[kept]
+    distances = np.linalg.norm(boxes.centers - pose[:3, 3], axis=1)
+    covered = intersections(inside, inside) / areas(inside)[:, None] * (distances[:, None] > distances + NEARER_M)
+    is_counted = (_heights(inside) >= LEAST_PX) & (areas(inside) >= IN_VIEW * areas(whole))
+    is_counted &= covered.max(axis=1, initial=0) < HIDDEN
+    scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
+
+    known = np.array([name in _OF_COCO for name in seen.classes.tolist()], dtype=bool) & (seen.scores >= POSSIBLE)
+    kinds = np.array([_OF_COCO[name] for name in seen.classes[known].tolist()], dtype=int)
+    double = overlaps(seen.corners[known], seen.corners[known]) * (kinds[:, None] == kinds) > DOUBLE
+    single = ~np.triu(double, 1).any(axis=0)  # the better one of two, as they come by falling score
+    corners, certainties, kinds = seen.corners[known][single], seen.scores[known][single], kinds[single]
+    is_whole = np.concatenate([corners[:, :2] > EDGE_PX, corners[:, 2:] < size - 1 - EDGE_PX], axis=1).all(axis=1)
+    rides = (kinds == 1) & (overlaps(corners, corners[kinds == 2]).max(axis=1, initial=0) > RIDER)
+    is_sure = (certainties >= SURE) & is_whole & (_heights(corners) >= LEAST_PX) & ~rides
+
+    table = overlaps(inside, corners) * (groups[:, None] == kinds)
+    rows, columns = linear_sum_assignment(table, maximize=True)
+    is_pair = table[rows, columns] > 0
+    rows, columns = rows[is_pair], columns[is_pair]
+
+    def pairs(own: NDArray[np.int64], of: NDArray[np.int64], count: int, others: Array) -> tuple[Array, Array]:
+        overlap, partners = np.zeros(count), np.full((count, 4), np.nan)
+        overlap[own], partners[own] = table[rows, columns], others[of]
+        return overlap, partners
+
+    ours, theirs = (
+        (np.full(count, frame.stamp.index), np.full(count, camera.name)) for count in (len(inside), len(corners))
+    )
+    ground = _ground_distances(camera, corners)
+    return (
+        Sightings(*ours, inside, groups, distances, scores, is_counted, *pairs(rows, columns, len(inside), corners)),
+        Sightings(*theirs, corners, kinds, ground, certainties, is_sure, *pairs(columns, rows, len(corners), inside)),
+    )
+
+
+def _heights(corners: Array) -> Array:
+    return np.asarray(corners[:, 3] - corners[:, 1])
+
+
+def _ground_distances(camera: Camera, corners: Array) -> Array:
+    """(N,) distance of what stands on flat ground at the lower edge of a rectangle; inf above the horizon."""
+    feet = np.stack([corners[:, [0, 2]].mean(axis=1), corners[:, 3]], axis=1)
+    rays = camera.rays(feet) @ camera.ego_from_camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = np.where(rays[:, 2] < 0, -camera.ego_from_camera[2, 3] / rays[:, 2], np.inf)
+    places = camera.ego_from_camera[:2, 3] + rays[:, :2] * steps[:, None]
+    return np.nan_to_num(np.linalg.norm(places, axis=1), nan=np.inf, posinf=np.inf)
+
+
+_NO, _NONE = np.zeros(0), np.zeros((0, 4))
+NOTHING = Sightings(_NO.astype(int), _NO.astype(str), _NONE, _NO.astype(int), _NO, _NO, _NO.astype(bool), _NO, _NONE)

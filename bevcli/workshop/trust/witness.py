@@ -1,0 +1,70 @@
+"""The second witness: a detector of people, cycles and vehicles in images, which learned from photographs alone.
+
+Its weights are those of the backbone of the model `photographs`. That model's own boxes in images are these.
+"""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bevcli.checkpoints import bundled_weights, read_safetensors
+from bevcli.config import load_config
+from bevcli.errors import InputError
+from bevcli.frame import Frame
+from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.inference.image_boxes import camera_boxes
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.nanodet import NanoDet, NanoDetConfig
+
+SOURCE, PART = "photographs", "backbone."  # the model of the package whose weights have the detector's, and where
+
+
+@dataclass(frozen=True)
+class Witness:
+    """A detector, and how it gets its images."""
+
+    detector: NanoDet
+    preprocessor: Preprocessor
+
+    def seen(self, frame: Frame) -> Mapping[str, Boxes2D]:
+        """Camera -> the boxes in its image, of the cameras that have one."""
+        prepared = self.preprocessor(frame)
+        if not prepared.has_image.any():
+            return {}
+        with torch.inference_mode():
+            maps = self.detector(prepared.images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+            found = self.detector.image_boxes(maps, prepared.has_image)
+        return camera_boxes(found, prepared, self.preprocessor.config.image)
+
+
+def seen_in_run(path: Path) -> dict[tuple[int, int], dict[str, Boxes2D]]:
+    """The image_boxes.csv of a run: index and time of a frame -> cell of a camera -> boxes. Raises InputError."""
+    rows: dict[tuple[int, int], dict[str, list[list[str]]]] = {}
+    try:
+        for index, _, time, camera, *cells in list(csv.reader(path.read_text(encoding="utf-8").splitlines()))[1:]:
+            rows.setdefault((int(index), int(time)), {}).setdefault(camera, []).append(cells)
+        return {stamp: {name: _boxes(of) for name, of in cameras.items()} for stamp, cameras in rows.items()}
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as boxes in images ({error}): run again with --force") from None
+
+
+def _boxes(rows: list[list[str]]) -> Boxes2D:
+    """Boxes of rows of class, score and edges."""
+    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(len(rows), 5)
+    return Boxes2D(numbers[:, 1:], np.array([row[0] for row in rows]), numbers[:, 0])
+
+
+@cache
+def load_witness() -> Witness:
+    """The witness of the package, on the CPU."""
+    path = bundled_weights(SOURCE)
+    assert path is not None
+    tensors, _ = read_safetensors(path)
+    detector = NanoDet(NanoDetConfig())
+    detector.load_state_dict({key.removeprefix(PART): x for key, x in tensors.items() if key.startswith(PART)})
+    return Witness(detector.eval().to(memory_format=torch.channels_last), Preprocessor(load_config(SOURCE), threads=1))  # type: ignore[call-overload]
