@@ -238,3 +238,20 @@ def test_a_camera_an_image(tmp_path, program, layout):
             written(tmp_path, document, "transforms.json")
         with pytest.raises(InputError, match=f"{NAMES[0]}: its images have focal lengths of 633 to 7"):
             read(path)
+
+
+def test_four_coefficients_without_a_lens_are_noted_and_the_other_is_stated(tmp_path):
+    """cv2.fisheye.calibrate writes four numbers, too. The advice of the note is followed."""
+    cameras = {name: {"K": k_of(name).tolist(), "D": [[0.02], [0.004], [-0.003], [0.001]],
+                      "ego_from_camera": pose(name).tolist()} for name in NAMES}  # fmt: skip
+    found = read(written(tmp_path, cameras, "rig.json"))
+    assert found.rig[NAMES[0]].distortion.model == "brown_conrady"
+    assert "are taken as k1, k2, p1, p2; if they are k1 to k4 of a fisheye" in found.notes[1]
+    assert "state distortion_model: fisheye beside them" in found.notes[1]
+    stated = {name: {**camera, "distortion_model": "fisheye"} for name, camera in cameras.items()}
+    for each in (stated, {name: {**without(camera, "D"), "k1": 0.02, "k2": 0.004, "k3": -0.003, "k4": 0.001}
+                          for name, camera in cameras.items()}):  # fmt: skip
+        found = read(written(tmp_path, each, "rig.json"))
+        assert found.rig[NAMES[0]].distortion.model == "kannala_brandt"
+        assert found.rig[NAMES[0]].distortion.coefficients == (0.02, 0.004, -0.003, 0.001)
+        assert len(found.notes) == 1

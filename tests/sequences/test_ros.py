@@ -403,6 +403,15 @@ def test_a_calibration_with_cameras_not_found_names_the_option(
     assert sequence.rig.names == native.rig.names
 
 
+def test_cameras_of_a_calibration_without_a_topic_are_left_out(
+    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
+) -> None:
+    messages = [message for message in messages_of(native, motion) if "CAM_BACK" not in message[0]]
+    sequence = open_sequence(write(tmp_path, "mcap", messages), calibration=drive / "calibration.json")
+    assert sequence.rig.names == ("CAM_FRONT",)
+    assert "without images, left out: CAM_BACK" in sequence.notes
+
+
 def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
     late = 1_400_000_000
     messages = [m for m in messages_of(native, motion) if m[0] != "/odom" or m[2] >= late]

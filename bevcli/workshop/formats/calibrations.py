@@ -48,6 +48,10 @@ from bevcli.workshop.formats.vins_fusion import main_files, read_vins_fusion
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera
 SEVERAL = "is the video of one camera, but the calibration has {} ({}): name the video after its camera"
+OPEN_LENS = (
+    "{}: the four coefficients of {} are taken as k1, k2, p1, p2; if they are k1 to k4 of a fisheye (cv2.fisheye), "
+    "state distortion_model: fisheye beside them"
+)
 HIGHEST_M = 10.0  # of a camera that is stated
 
 
@@ -74,6 +78,8 @@ def read_rig(
     format_name, cameras = _read_cameras(calibration)
     if extrinsics is not None:
         poses = _extrinsics(extrinsics)
+        if len(poses) == len(cameras) == 1:  # whatever each file calls it
+            poses = dict(zip(cameras, poses.values(), strict=True))
         for name in poses.keys() - cameras.keys():
             raise InputError(f"{extrinsics}: camera {name}: has no intrinsics (found those of {', '.join(cameras)})")
         cameras = {name: replace(of, pose=poses[name].pose if name in poses else None) for name, of in cameras.items()}
@@ -95,7 +101,10 @@ def read_rig(
     )
     ego_from_bev = _bev_frame(where)
     camera_rig = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
-    return RigDraft(camera_rig, (Finding("calibration-read", "info", None, text),))
+    findings = [Finding("calibration-read", "info", None, text)]
+    if is_open := [name for name in used if cameras[name].lens_is_open]:
+        findings.append(Finding("lens-assumed", "info", None, OPEN_LENS.format(calibration.name, ", ".join(is_open))))
+    return RigDraft(camera_rig, tuple(findings))
 
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:

@@ -87,6 +87,7 @@ class StatedCamera:
         pose: None if it is not stated.
         moves: the file has several poses of the camera, as a reconstruction of a drive has.
         from_previous: (4, 4) camera_from_previous_camera of a Kalibr chain.
+        lens_is_open: four coefficients without the name of a lens, which a fisheye has too.
     """
 
     intrinsics: Any = None
@@ -95,6 +96,7 @@ class StatedCamera:
     pose: StatedPose | None = None
     moves: bool = False
     from_previous: Array | None = None
+    lens_is_open: bool = False
 
 
 Cameras: TypeAlias = dict[str, StatedCamera]

@@ -164,13 +164,17 @@ def _named_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
         sides = (_value(size, *WIDTH), _value(size, *HEIGHT))
     elif size is not None:
         sides = tuple(require(parse_numbers, {"resolution": size}, "resolution", (2,), where=where).tolist())
-    chain = entry.get("T_cn_cnm1")
+    chain, lens = entry.get("T_cn_cnm1"), lens_of(fields, model, where)
+    is_named = _value(fields, "cameramodel", "modeltype", *LENS_MODEL) is not None
     return StatedCamera(
         _camera_matrix(intrinsics, fields, where),
         sides if None not in sides else None,
-        lens_of(fields, model, where),
+        lens,
         _pose(entry, where),
         from_previous=None if chain is None else require(parse_numbers, entry, "T_cn_cnm1", (4, 4), where=where),
+        lens_is_open=not is_named
+        and isinstance(_value(fields, *LENS), list)
+        and len(lens.get("coefficients", ())) == 4,
     )
 
 
@@ -201,6 +205,9 @@ def lens_of(entry: Mapping[str, Any], camera_model: str, where: str) -> Fields:
         value = _value(value, "data", "coefficients", "coeffs", "params") or value
     fisheye = LENS_NAMES.get(_lens_name(model or camera_model)) == "kannala_brandt"
     if value is None or isinstance(value, dict):
+        stated = {_plain(name) for name in value or entry}
+        fisheye = fisheye or (not model and {"k3", "k4"} <= stated and not stated & {"p1", "p2", "k5"})
+        model = "fisheye" if fisheye else model
         names = COEFFICIENTS["kannala_brandt" if fisheye else "brown_conrady"]
         numbers = [_value(value or entry, name) for name in names]
         count = max((position for position, number in enumerate(numbers, 1) if number is not None), default=0)

@@ -243,7 +243,7 @@ class TopicFinder:
     """
 
     def __init__(self, bag: Bag, stated: StatedTopics, calibrated: Iterable[str] | None = None) -> None:
-        """calibrated: the cameras of a calibration file, which all must be found. None: the bag is the calibration."""
+        """calibrated: the cameras of a calibration file. None: the bag is the calibration."""
         self._bag, self._topics = bag, stated
         self._kinds = {
             name: KINDS[topic.short_type]
@@ -366,12 +366,22 @@ def _named(topics: Mapping[tuple[str, ...], str]) -> Iterator[tuple[str, str]]:
         yield "_".join(path[-count:]), topic
 
 
+def _fitting(topics: Mapping[str, str], lower: str) -> list[str]:
+    """The topics of a camera, by its name in lower case."""
+    same = [topic for camera, topic in topics.items() if camera.lower() == lower]
+    return same or [topic for topic in topics.values() if lower in topic.lower().split("/")]
+
+
 def _for_calibration(topics: Mapping[str, str], names: tuple[str, ...], bag: Bag) -> Iterator[tuple[str, str]]:
-    """Camera of a calibration file -> topic: of the same name, or with the name as a part."""
-    for name in names:
-        lower = name.lower()
-        same = [topic for camera, topic in topics.items() if camera.lower() == lower]
-        fitting = same or [topic for topic in topics.values() if lower in topic.lower().split("/")]
+    """Camera of a calibration file -> topic: of the same name, or with the name as a part.
+
+    Cameras without a topic are left out where each topic belongs to another one.
+    """
+    fitting_of = {name: _fitting(topics, name.lower()) for name in names}
+    are_taken = {fitting[0] for fitting in fitting_of.values() if len(fitting) == 1} == set(topics.values()) != set()
+    for name, fitting in fitting_of.items():
+        if are_taken and not fitting:
+            continue
         if len(fitting) != 1:
             offered = ", ".join(topics.values()) or "none"
             raise InputError(

@@ -222,7 +222,9 @@ def open_bag(path: Path, common: InputOptions, options: BagOptions) -> images.Li
     rig, facts, file, beside = _files_beside(path.parent if path.is_file() else path, rig, common, options)
     finder = TopicFinder(bag, stated_topics, rig.names if rig else None)
     reader = VehicleReader(bag, finder, stated_topics)
-    used_rig = reader.rig() if rig is None else rig
+    used_rig, with_images = reader.rig() if rig is None else rig, {camera.camera for camera in finder.cameras}
+    lost = [name for name in used_rig.names if name not in with_images]
+    used_rig = replace(used_rig, cameras=tuple(each for each in used_rig.cameras if each.name in with_images))
     entries = _entries(bag, finder.cameras)
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
     drive_poses = DrivePoses(used_rig, options, frame_times)
@@ -235,6 +237,7 @@ def open_bag(path: Path, common: InputOptions, options: BagOptions) -> images.Li
         *bag.notes,
         *beside,
         *reader.notes,
+        *([f"without images, left out: {', '.join(lost)}"] if lost else []),
         *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
         *images.bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
         *motion_notes,
