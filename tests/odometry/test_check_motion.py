@@ -69,9 +69,9 @@ def shown(monkeypatch):
     def measure(drive):
         for place in range(len(drive.stamps)):
             drive.load(place)
-        return SHOWN
+        return iter(SHOWN.steps)
 
-    monkeypatch.setattr(comparing, "measure_motion", measure)
+    monkeypatch.setattr(comparing, "measure_steps", measure)
 
 
 @pytest.mark.parametrize("in_table", [True, False])
@@ -81,11 +81,12 @@ def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
     assert finding.code == "motion-scale"
 
 
-def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch):
-    monkeypatch.setattr(calibrate, "motion_findings", lambda drive: (OFF,))
+def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch, capsys):
+    monkeypatch.setattr(calibrate, "motion_steps", lambda drive: iter([None, (OFF,)]))
     (finding,) = check(MadeDrive(MISTAKES["km/h"][0]))
     assert finding.code == "motion-scale"
     assert check(MadeDrive(stated())) == (OFF,)
+    assert "steps of the check of poses and calibration" in capsys.readouterr().err
 
 
 def test_one_cause_is_told_where_both_are_off():
@@ -119,7 +120,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch):
     def refuse(drive):
         raise InputError("memory: has one frame")
 
-    monkeypatch.setattr(comparing, "measure_motion", refuse)
+    monkeypatch.setattr(comparing, "measure_steps", refuse)
     (finding,) = stated_motion_findings(MemoryDrive(1))
     assert (finding.code, finding.severity) == ("motion-not-compared", "info")
     assert "memory: has one frame" in finding.message

@@ -18,6 +18,7 @@ from bevcli.geometry.transforms import Pose, rigid
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
 from bevcli.workshop.odometry import compare, views
+from bevcli.workshop.odometry.measure import measure_steps
 from bevcli.workshop.robustness.conditions import choose_conditions
 
 
@@ -270,7 +271,7 @@ def without_repetition() -> None:
         return hashlib.sha256(pixels + repr(rig).encode()).digest()
 
     views.features = once(views.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
-    compare.measure_motion = once(compare.measure_motion, images_of)
+    compare.measure_steps = once(lambda drive: list(measure_steps(drive)), images_of)
 
 
 def table(folders: list[str], rigs: int, minutes: float) -> None:

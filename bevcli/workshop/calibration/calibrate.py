@@ -1,14 +1,14 @@
 """`calibrate`: a drive -> how far its calibration is off, from what its images show between two frames.
 
 In this order: the rounds of the measurement, rotations from matched points and heights from the road; the verdicts.
-`motion_findings` is the same in short, as findings for `bevcli project-debug`.
+`motion_steps` is the same in short, as findings for `bevcli project-debug`.
 """
 
 import json
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -50,6 +50,7 @@ from bevcli.workshop.correspondence.images import WIDTH
 from bevcli.workshop.correspondence.residuals import DepthResiduals, RoadResiduals
 from bevcli.writing import write_whole
 
+Result = TypeVar("Result")
 EVEN_MS = 0.01  # largest difference of intervals between frames that are the same
 SCALES_PX = (20.0, 5.0, 1.5, 0.7)  # of Cauchy's loss for points, one search after the other
 POINT_SCALE_PX, ROAD_SCALES_PX = 0.3, (3.0, 1.0, 0.5)  # then: the smallest one, and those of road points
@@ -245,8 +246,8 @@ def calibrate(drive: Drive, options: CalibrateOptions | None = None, **changes: 
     return last(calibration_steps(drive, gather(CalibrateOptions, options, changes)))
 
 
-def last(steps: Iterable[CalibrationResult | None]) -> CalibrationResult:
-    """The result of all steps of a calibration."""
+def last(steps: Iterable[Result | None]) -> Result:
+    """The result of all steps of some work."""
     *_, result = steps
     assert result is not None
     return result
@@ -405,13 +406,16 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
     return changes, np.stack([blocks[c, :, c] for c in range(unknowns.cameras)]), rig
 
 
-def motion_findings(drive: Drive) -> tuple[Finding, ...]:
-    """Findings about the cameras whose calibration does not fit how the vehicle moves, measured from a few frames."""
+def motion_steps(drive: Drive) -> Iterator[tuple[Finding, ...] | None]:
+    """Findings about the cameras whose calibration does not fit how the vehicle moves, measured from a few frames.
+
+    In STEPS parts: None after each of them but the last, then the findings.
+    """
     try:
-        result = calibrate(drive, pairs=SHORT_PAIRS)
+        for result in calibration_steps(drive, CalibrateOptions(pairs=SHORT_PAIRS)):
+            yield None if result is None else findings_of(result.cameras, result.interval_ms)
     except InputError as error:
-        return (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
-    return findings_of(result.cameras, result.interval_ms)
+        yield (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
 
 
 def findings_of(cameras: Sequence[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:

@@ -7,7 +7,7 @@ from bevcli.printing import say
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibration
 from bevcli.workshop.calibration.estimates import Verdict, change_text
-from bevcli.workshop.odometry.compare import stated_motion_findings, without_consequences
+from bevcli.workshop.odometry.compare import STEPS, stated_motion_steps, without_consequences
 
 
 def corrected(drive: Drive) -> Drive:
@@ -24,7 +24,10 @@ def check_motion(drive: Drive | None) -> tuple[Finding, ...]:
     """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone (None)."""
     if drive is None:
         return ()
-    motion = stated_motion_findings(drive)
-    if errors_of(motion):  # which make a calibration wrong
-        return motion
-    return without_consequences(motion, calibration.motion_findings(drive), len(drive.rig.cameras))
+    with Progress(STEPS + 1 + calibration.STEPS, "steps of the check of poses and calibration") as progress:
+        motion = calibration.last(progress.over(stated_motion_steps(drive)))
+        if errors_of(motion):  # which make a calibration wrong
+            return motion
+        progress.reach(STEPS + 1)
+        measured = calibration.last(progress.over(calibration.motion_steps(drive)))
+    return without_consequences(motion, measured, len(drive.rig.cameras))

@@ -18,7 +18,7 @@ from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.sequences.view import DriveView
-from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
+from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.workshop.odometry.stated import FREEDOMS, MeasuredSteps, Poses, mistakes, steps_between, turn_between
 
 FEWEST_STEPS = 3  # that are measured
@@ -335,14 +335,24 @@ MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to
 
 def stated_motion_findings(drive: Drive, steps: int = STEPS) -> tuple[Finding, ...]:
     """Findings about the stated poses of a drive, from a few measured steps; none for a drive without poses."""
+    *_, findings = stated_motion_steps(drive, steps)
+    return findings or ()
+
+
+def stated_motion_steps(drive: Drive, steps: int = STEPS) -> Iterator[tuple[Finding, ...] | None]:
+    """`stated_motion_findings`: None after each measured step, then the findings."""
     if not drive.has_ego_motion:
-        return ()
-    some = DriveView(drive, chosen_frames(drive, steps))
+        yield ()
+        return
+    some, measured = DriveView(drive, chosen_frames(drive, steps)), list[MeasuredStep]()
     try:
-        measured = measure_motion(some)
+        for step in measure_steps(some):
+            measured.append(step)
+            yield None
     except InputError as error:
-        return (not_compared(str(error)),)
-    return compare(stated_poses(some), measured, [stamp.index for stamp in some.stamps])
+        yield (not_compared(str(error)),)
+        return
+    yield compare(stated_poses(some), MeasuredMotion.of(some, measured), [stamp.index for stamp in some.stamps])
 
 
 def stated_poses(drive: Drive) -> EgoMotion:
