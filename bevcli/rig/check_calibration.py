@@ -27,7 +27,7 @@ from bevcli.rig import drawings
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.sequence_checks import check_scenes, rig_findings
-from bevcli.sequences.files.calibration_file import CALIBRATION, draft_of, draft_rig
+from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_of, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FolderOptions, NativeFolder
 from bevcli.sequences.native.folder import FolderDrive, read_frames_table
@@ -151,16 +151,19 @@ def check_calibration(
         if beside is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
             return _check_other_sequence(path, frame, options)
         if beside is not None and _is_other_drive(path):
-            return _check_other_sequence(path, frame, options, beside.findings)
+            return _check_other_sequence(path, frame, options, () if beside.readings else beside.findings)
         draft, folder = beside or draft_rig(path / CALIBRATION, path), path
     else:
         draft = draft_rig(path, folder, **of_rig)
-    if folder is not None and _is_other_drive(folder):
-        return _check_other_sequence(folder, frame, {**options, "calibration": path}, draft.findings)
+    if folder is None:
+        draft = draft.certain()
+    elif _is_other_drive(folder):
+        found_before = () if draft.readings else draft.findings
+        return _check_other_sequence(folder, frame, {**options, "calibration": path}, found_before)
     of_drive: tuple[Finding, ...] = ()
     images: Mapping[str, NDArray[np.uint8]] = {}
     if folder is not None and draft.rig.cameras:
-        of_drive, images = _read_folder(folder, draft.rig, frame, options)
+        draft, of_drive, images = _read_folder(folder, draft, frame, options)
     name = os.path.basename(os.path.realpath(folder or (path if path.is_dir() else path.with_suffix(""))))
     return check_rig(draft.rig, draft.findings, name, images).with_findings(of_drive)
 
@@ -192,34 +195,35 @@ def _check_other_sequence(
 
 
 def _read_folder(
-    folder: Path, rig: CameraRig, frame: int, options_given: Mapping[str, Any]
-) -> tuple[tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
-    """The findings about a native folder, and the images by camera of one of its frames."""
+    folder: Path, draft: RigDraft, frame: int, options_given: Mapping[str, Any]
+) -> tuple[RigDraft, tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
+    """The rig as the images show it, the findings about a native folder, and the images by camera of one frame."""
     findings: list[Finding] = []
     outside = bool(options_given.get("allow_outside"))
     native = FolderOptions(**{name: options_given[name] for name in NAMES & options_given.keys()})
     options = InputOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
-        sequence = FolderDrive(folder, options, native, rig)
+        sequence = FolderDrive(folder, options, native, draft)
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderDrive(folder, replace(options, ego_motion="static"), native, rig)
+            sequence = FolderDrive(folder, replace(options, ego_motion="static"), native, replace(draft, readings=()))
         except InputError:
-            return tuple(findings), {}
+            return draft, tuple(findings), {}
+    draft = sequence.draft
     if sequence.ego_motion is not None:
         findings += check_scenes(sequence.ego_motion, sequence.stamps)
     if sequence.understood:
         findings.append(Finding("no-frames-table", "info", None, sequence.understood))
     else:
-        findings += _check_times(folder / "frames.csv", rig)
+        findings += _check_times(folder / "frames.csv", draft.rig)
     index = _checked_index(sequence.stamps, frame, folder)
     try:
         shown = sequence.load(index)
     except InputError as error:
-        return (*findings, _refused(error)), {}
-    return (*findings, *_missing_images(shown)), _pixels(shown)
+        return draft, (*findings, _refused(error)), {}
+    return draft, (*findings, *_missing_images(shown)), _pixels(shown)
 
 
 def _checked_index(stamps: tuple[FrameStamp, ...], frame: int, path: Path) -> int:

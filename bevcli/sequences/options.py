@@ -169,7 +169,25 @@ class RigOptions:
         reads="path", default=None, help="The poses of the cameras, in place of those of --calibration."
     )
     transform: Literal["ego_from_camera", "camera_from_ego"] | None = option(
-        default=None, help="What the transforms of --calibration are, where both are possible."
+        default=None, help="What the transforms of --calibration are. Default: what the images show."
+    )
+    rig_axes: Literal["flu", "frd", "rfu", "rdf"] | None = option(
+        default=None,
+        help="Axes x, y, z of the vehicle in --calibration: f forward, l left, r right, u up, d down. Default: what "
+        "the images show.",
+    )
+    camera_axes: Literal["optical", "vehicle", "opengl"] | None = option(
+        default=None,
+        help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
+        "up (opengl).",
+    )
+    rig_angles: Literal["wxyz", "xyzw", "vector", "radians", "degrees"] | None = option(
+        default=None,
+        help="What the numbers of a rotation in --calibration are: a quaternion, a rotation vector, or roll, pitch and "
+        "yaw.",
+    )
+    rig_unit: Literal["m", "cm", "mm"] | None = option(
+        default=None, help="Unit of the translations in --calibration. Default: the one that gives a vehicle."
     )
     fov_deg: float | Mapping[str, float] | None = option(
         default=None,
@@ -206,13 +224,24 @@ class RigOptions:
     pose_times: TimeUnit | None = option(
         default=None, help="Unit of the times in --ego-motion. Default: the only possible one."
     )
-    pose_angles: Literal["degrees", "radians", "compass"] | None = option(
+    pose_angles: Literal["degrees", "radians", "compass", "compass-radians", "wxyz", "xyzw"] | None = option(
         default=None,
-        help="Unit of the angles in --ego-motion; compass: degrees clockwise from north. Default: what fits how "
-        "the vehicle moves.",
+        help="Unit of the angles in --ego-motion (compass: degrees clockwise from north), or the order of its "
+        "quaternions. Default: what the images show.",
     )
     poses_of: str | None = option(
         default=None,
-        help='Camera whose poses --ego-motion has, or "vehicle". Default: vehicle, and camera 0 for KITTI.',
+        help='Camera whose poses --ego-motion has, or "vehicle". Default: what the images show.',
         metavar="CAMERA|vehicle",
+    )
+    pose_axes: Literal["flu", "frd", "rfu"] | None = option(
+        default=None, help="Axes of the vehicle in --ego-motion, as --rig-axes. Default: what the images show."
+    )
+    pose_transform: Literal["world_from_body", "body_from_world"] | None = option(
+        default=None, help="What the poses of --ego-motion are. Default: what the images show."
+    )
+    image_check: bool = option(
+        default=True,
+        help="Compare what --calibration and --ego-motion may mean with the images.",
+        flag="--image-check/--no-image-check",
     )

@@ -124,8 +124,7 @@ def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
     direction = (
         "camera_from_ego" if spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec") else "ego_from_camera"
     )
-    assert f"{direction}, camera axes {'x forward' if 'axes' in spelling else 'x right'}" in line
-    assert ("its name says camera_from_ego" in line) == ("but" in spelling)
+    assert re.search(f"{direction}, .*camera axes {'x forward' if 'axes' in spelling else 'x right'}", line)
 
 
 @pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
@@ -309,31 +308,25 @@ def test_a_direction_that_is_not_certain_is_asked(tmp_path):
     """The rotation of a camera that looks to the right is its own inverse, and both heights are possible here."""
     matrix = np.array([[-1.0, 0, 0, 1.2], [0, 0, -1, 1.0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
     stated = {"K": k_of(NAMES[0]).tolist(), "T": matrix.tolist(), "width": SIZE[0], "height": SIZE[1]}
-    path = written(tmp_path, {"front": stated})
-    with pytest.raises(
-        InputError, match=r'two directions.*`transform="ego_from_camera"` .* or `transform="camera_from_ego"`'
-    ):
-        read(path, None)
-    one, other = (read(path, None, transform=each).rig for each in ("ego_from_camera", "camera_from_ego"))
-    np.testing.assert_allclose(one["front"].ego_from_camera, matrix)
-    np.testing.assert_allclose(other["front"].ego_from_camera, np.linalg.inv(matrix))
+    path = written(tmp_path, {"side": stated})
+    with pytest.raises(InputError, match=r"no images decide .*`--transform ego_from_camera.*--transform camera_from"):
+        bevcli.read_calibration(path, rig_axes="flu", camera_axes="optical")
+    for direction, expected in (("ego_from_camera", matrix), ("camera_from_ego", np.linalg.inv(matrix))):
+        found = bevcli.read_calibration(path, transform=direction, rig_axes="flu", camera_axes="optical")
+        np.testing.assert_allclose(found["side"].ego_from_camera, expected)
 
 
-@pytest.mark.parametrize("height", [1.5, -0.3])
-def test_the_sign_of_a_height_alone_decides_nothing(tmp_path, height):
-    """A camera with the vehicle's axes is upright in both directions; the origin may be on the ground or in a lidar."""
-    matrix = np.eye(4)
-    matrix[:3, 3] = (1.2, 0, height)
-    stated = {"K": k_of(NAMES[0]).tolist(), "T": matrix.tolist(), "width": SIZE[0], "height": SIZE[1]}
-    path = written(tmp_path, {"front": stated})
-    with pytest.raises(InputError, match=r'below the origin.*`transform="'):
-        read(path, None)
-    rig = read(path, None, transform="ego_from_camera", height=1.5).rig
-    np.testing.assert_allclose(rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
-    stated["T_ego_cam"] = stated.pop("T")
-    named = written(tmp_path, {"front": stated}, "named.yaml")
-    if height > 0:
-        np.testing.assert_allclose(read(named, None).rig["front"].ego_from_camera[:3, 3], [1.2, 0, 1.5])
+def test_every_reading_that_is_named_can_be_stated(tmp_path):
+    """The readings of a camera whose name says nothing, each by the options that the error names."""
+    path = written(tmp_path, {"eye": entry(NAMES[0], T=pose(NAMES[0]).tolist(), resolution=list(SIZE))})
+    with pytest.raises(InputError) as asked:
+        bevcli.read_calibration(path, STREET)
+    choices = re.findall("`(--[^`]*)`", str(asked.value))
+    assert len(choices) > 1
+    for choice in choices:
+        words = choice.split()
+        stated = {flag[2:].replace("-", "_"): value for flag, value in zip(words[::2], words[1::2], strict=True)}
+        assert len(read(path, **stated).readings) == 1
 
 
 def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):
@@ -341,8 +334,6 @@ def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):
     for matrix in lowered.values():
         matrix[2, 3] -= 1.84
     path = written(tmp_path, {name: entry(name, T=lowered[name].tolist()) for name in NAMES})
-    with pytest.raises(InputError, match=r"(above|below) the origin.*`height=1.5`"):
-        read(path)
     heights = {name: float(pose(name)[2, 3]) for name in NAMES}
     assert_is_the_street(read(path, height=heights).rig, lens=True)
 
@@ -352,19 +343,19 @@ def scaled(matrix, factors):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_drawn_rigs_are_read_right_in_both_directions(tmp_path, seed):
+def test_drawn_rigs_are_among_the_readings_both_ways(tmp_path, seed):
     """A whole rig under a name that states nothing; each camera alone under one that states the direction."""
     cameras = draw_rig(RigDistribution(), seed, SIZE).rig.cameras
-    assert_read_right(tmp_path, cameras)
+    assert_among_the_readings(tmp_path, cameras)
 
 
-def test_real_rigs_are_read_right_in_both_directions(shared, tmp_path):
+def test_real_rigs_are_among_the_readings_both_ways(shared, tmp_path):
     for drive in ("nuscenes-scene-0103", "kitti-straight", "dgp-scene_01"):
         sequence = bevcli.open_sequence(shared / "data" / drive, ego_motion="optional", ground_truth=False)
-        assert_read_right(tmp_path, sequence.rig.cameras)
+        assert_among_the_readings(tmp_path, sequence.rig.cameras)
 
 
-def assert_read_right(folder, cameras):
+def assert_among_the_readings(folder, cameras):
     for rig in (cameras, *((camera,) for camera in cameras)):
         for name, stated in (("T_ego_cam", np.array), ("T_cam_ego", np.linalg.inv)):
             key = name if len(rig) == 1 else "T"
@@ -375,9 +366,12 @@ def assert_read_right(folder, cameras):
                 }
                 for camera in rig
             }  # fmt: skip
-            found = read(written(folder, entries, "rig.json"), None).rig
-            for camera in rig:
-                np.testing.assert_allclose(found[camera.name].ego_from_camera, camera.ego_from_camera, atol=1e-9)
+            truth = {camera.name: camera.ego_from_camera for camera in rig}
+            readings = read(written(folder, entries, "rig.json"), None).readings
+            assert any(
+                all(np.allclose(each.ego_from_camera[name], truth[name], atol=1e-9) for name in truth)
+                for each in readings
+            )
 
 
 MISTAKES = {

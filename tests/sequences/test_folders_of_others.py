@@ -41,11 +41,13 @@ def kalibr_of(folder: Path, count: int) -> Path:
 
 def test_cameras_without_images_are_left_out_with_a_note(tmp_path):
     drive = images_of(tmp_path / "drive", "cam0", "cam3")
-    sequence = open_sequence(drive, calibration=kalibr_of(tmp_path, 6), image_rate_hz=2, ego_motion="static")
+    sequence = open_sequence(
+        drive, calibration=kalibr_of(tmp_path, 6), image_rate_hz=2, ego_motion="static", rig_axes="flu"
+    )
     assert sequence.rig.names == ("cam0", "cam3")
     assert "without images, left out: cam1, cam2, cam4, cam5" in " ".join(sequence.notes)
     shutil.copytree(drive / "cam0", drive / "cam8")
-    how = {"calibration": tmp_path / "camchain.yaml", "image_rate_hz": 2, "ego_motion": "static"}
+    how = {"calibration": tmp_path / "camchain.yaml", "image_rate_hz": 2, "ego_motion": "static", "rig_axes": "flu"}
     with pytest.raises(InputError, match=r"cam1: the image size is missing.*or name the folder of its images cam1"):
         open_sequence(drive, **how)
     (drive / "cam8").rename(drive / "cam1")

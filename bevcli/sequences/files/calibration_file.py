@@ -20,12 +20,14 @@ from bevcli.options import named
 from bevcli.parsing.documents import read_json
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
+from bevcli.sequences.files.readings import RigReading, question
 from bevcli.sequences.options import RigOptions
 from bevcli.writing import write_whole
 
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 LARGEST_JSON = 64 << 20  # of another program, such as that of a reconstruction
+RIG_STATEMENTS = ("transform", "rig_axes", "camera_axes", "rig_angles", "rig_unit")  # options of what transforms are
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LONGEST_NAME = 60  # characters of a wrong name in a message
 LARGEST_SIZE = 16384  # pixels of a side
@@ -48,11 +50,16 @@ class RigDraft:
         rig: the cameras with usable fields, possibly none. Invalid rotations are replaced by the nearest valid ones.
         findings: what is wrong with the file. Whether its numbers are plausible is checked in `bevcli.rig`.
         facts: what the file states about the drive.
+        readings: what the poses in a file of another program may be, the rig being the first; empty where they are
+            certain.
+        file: of the poses.
     """
 
     rig: CameraRig
     findings: tuple[Finding, ...]
     facts: DriveFacts = field(default_factory=DriveFacts)
+    readings: tuple[RigReading, ...] = ()
+    file: Path = Path()
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -65,15 +72,21 @@ class RigDraft:
             raise InputError(f"{path}: {error.line}")
         return self
 
+    def certain(self) -> "RigDraft":
+        """The draft itself. Raises InputError where its poses have several readings."""
+        if len(self.readings) > 1:
+            raise question(self.file, "no images decide between them", self.readings)
+        return self
+
 
 def read_calibration(path: str | Path, drive: str | Path | None = None, **how: Any) -> CameraRig:
     """The rig in calibration.json, or in a calibration of another program (docs/other-inputs.md).
 
     drive: a folder or a video whose images state sizes that the calibration does not.
-    how: options of a calibration of another program: `extrinsics`, `transform`, `height`, `yaw_deg` of `RigOptions`.
-    Raises InputError with the first mistake in the file.
+    how: options of a calibration of another program: `extrinsics`, `transform`, `height`, `rig_axes` and so on.
+    Raises InputError with the first mistake in the file, and where its poses have several readings.
     """
-    return draft_rig(Path(path), None if drive is None else Path(drive), **how).checked(Path(path)).rig
+    return draft_rig(Path(path), None if drive is None else Path(drive), **how).checked(Path(path)).certain().rig
 
 
 def draft_rig(path: Path | None, drive: Path | None = None, **how: Any) -> RigDraft:
@@ -101,7 +114,7 @@ def draft_of(options: RigOptions, drive: Path | None = None) -> RigDraft | None:
         raise InputError(
             "`calibration` (`--calibration`) and `intrinsics` (`--intrinsics`) are the same: pass one of them"
         )
-    names = ("extrinsics", "transform", "fov_deg", "height", "yaw_deg")
+    names = ("extrinsics", "fov_deg", "height", "yaw_deg", *RIG_STATEMENTS)
     how = {name: value for name in names if (value := getattr(options, name)) is not None}
     path = options.intrinsics if options.calibration is None else options.calibration
     return None if path is None and not how else draft_rig(path, drive, **how).checked(path or Path())

@@ -12,6 +12,7 @@ from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there, open_regular
+from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.options import RigOptions
 
 TRANSLATION = ("x", "y", "z")
@@ -35,11 +36,13 @@ class DrivePoses:
         rig: of the drive.
         stated: `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found.
         times_ns: (F,) of its frames; None while they are not known.
+        rig_is_open: the poses of its cameras are one of several readings.
     """
 
     rig: CameraRig
     stated: RigOptions
     times_ns: NDArray[np.int64] | None = None
+    rig_is_open: bool = False
 
     @property
     def cameras_ahead(self) -> list[Camera]:
@@ -55,11 +58,15 @@ class ReadPoses:
         motion: None without poses.
         notes: for the user, such as how the file was read.
         geo_origin: the place of their world frame on Earth, where the file says it.
+        readings: what the poses of another program may be, the motion being the first; empty where they are certain.
+        file: of the poses.
     """
 
     motion: EgoMotion | None
     notes: tuple[str, ...] = ()
     geo_origin: GeoOrigin | None = None
+    readings: tuple[PoseReading, ...] = ()
+    file: Path = Path()
 
 
 def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
@@ -24,7 +23,7 @@ from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
 from bevcli.sequences.native import FolderOptions
-from bevcli.sequences.options import EgoMotionUse, InputOptions
+from bevcli.sequences.options import EgoMotionUse, InputOptions, RigOptions
 from bevcli.sequences.videos import rotation_notes
 
 BOXES_FILE = "ground_truth.json"
@@ -37,8 +36,9 @@ NO_IMAGE = "no image in frames.csv"
 class FolderDrive(ListedDrive):
     """A native sequence folder as a `Drive`.
 
-    rig: used in place of the rig of `own` and of calibration.json, if given.
+    draft: used in place of the rig of `own` and of calibration.json, if given.
     Attribute understood: how the images were understood without frames.csv, "" with it.
+    Attribute draft: the rig, as the images show it.
     Raises InputError if a file of the folder is missing or invalid.
     """
 
@@ -47,18 +47,17 @@ class FolderDrive(ListedDrive):
         path: Path,
         common: InputOptions = InputOptions(),
         own: FolderOptions = FolderOptions(),
-        rig: CameraRig | None = None,
+        draft: RigDraft | None = None,
     ) -> None:
         if not path.is_dir():
             raise InputError(f"{path}: the sequence folder is missing")
-        if rig is None:
+        if draft is None:
             draft = draft_of(own, path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
-        else:
-            draft = RigDraft(rig, ())
         rig, facts = draft.rig, draft.facts
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         entries = read_frames_table(table, rig.names) if is_there(table) else ()
-        poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries)))
+        is_open = bool(draft.readings)
+        poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries), is_open))
         self.understood, left_out, advice = "", "", "add ego-motion, or remove the frame"
         if not entries:
             from bevcli.workshop.formats.first_images import cameras_with_images
@@ -69,13 +68,15 @@ class FolderDrive(ListedDrive):
                 rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             frames = find_frames(path, rig.names, own, motion, has_poses=has_poses)
-            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0])))
+            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0]), is_open))
             entries, self.understood = frames if poses.motion is None else covered(frames, poses.motion)
             advice = "state the time of the first image by `start_ns` (`--start-ns`), or in timing.toml"
         assert poses is not None
         if not common.allow_outside:
             _check_paths(path, entries)
         check_covered(file, poses, entries, advice)
+        draft, poses = decided(replace(draft, rig=rig), poses, ListedDrive(path, common, rig, entries, None), own)
+        rig, self.draft = draft.rig, draft
         boxes, maps, has_truth = path / BOXES_FILE, path / MAPS_FOLDER, common.ground_truth  # each file may be missing
         self._boxes = read_boxes(boxes) if has_truth and is_there(existing(boxes)) else BoxesFile("ego", ())
         self._boxes_of = {frame.stamp.index: frame for frame in self._boxes.frames}
@@ -193,6 +194,19 @@ def check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...],
                     f"{file}: covers {first} to {last} ns, but {what} is at {time} ns ({entry.origin}; at most 50 ms "
                     f"outside is allowed{read_as}): {advice}"
                 )
+
+
+def decided(draft: RigDraft, poses: ReadPoses, images: ListedDrive, options: RigOptions) -> tuple[RigDraft, ReadPoses]:
+    """The rig and the poses of a drive without other readings, as its images show them.
+
+    images: the drive, with any of the rigs. Raises InputError where the images do not decide: it names the options
+    that do.
+    """
+    if not draft.readings and not poses.readings:
+        return draft, poses
+    from bevcli.workshop.readings.judge import decide
+
+    return decide(draft, poses, images, options)
 
 
 def read_frames_table(path: Path, cameras: tuple[str, ...]) -> tuple[FrameEntry, ...]:

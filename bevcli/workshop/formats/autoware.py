@@ -43,7 +43,7 @@ def with_own_names(document: Any, path: Path) -> Any:
             matrix = root_from_frame if match["optical"] else root_from_frame @ inverse(rigid(rotation=AXES["vehicle"]))
             name = "ego_from_camera" if root == VEHICLE else "T_rig_camera"
             cameras[frame[: match.start()] or frame] = {name: matrix.tolist()}
-    return cameras
+    return cameras or document  # cameras by their names may have such numbers too
 
 
 def _frames(document: Any, path: Path) -> Frames:

@@ -20,16 +20,16 @@ from bevcli.parsing.files import read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
 from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
+from bevcli.sequences.files.readings import RigReading
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.camera_poses import (
     Cameras,
-    Direction,
     Fields,
     StatedCamera,
     StatedPose,
-    decide_poses,
     guessed_pose,
     raised,
+    rig_readings,
 )
 from bevcli.workshop.formats.first_images import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.information_files import is_information, read_information
@@ -60,10 +60,10 @@ def read_rig(
     drive: Path | None = None,
     *,
     extrinsics: Path | None = None,
-    transform: Direction | None = None,
     fov_deg: ByCamera = None,
     height: ByCamera = None,
     yaw_deg: ByCamera = None,
+    **stated: str,
 ) -> RigDraft:
     """The rig of a file or folder of any kind, or of numbers. A finding says how it was understood. Raises InputError.
 
@@ -88,7 +88,8 @@ def read_rig(
     used, left_out = cameras_with_images(cameras, drive)
     # The poses of cameras without images tell how those of the others are meant.
     posed = {name: of for name, of in cameras.items() if name in used or of.pose is not None}
-    ego_from_camera, how = _poses(where, posed, transform, height, yaw_deg)
+    readings, how = _readings(where, posed, stated, height, yaw_deg)
+    ego_from_camera = readings[0].ego_from_camera
     rig = tuple(
         require(
             parse_camera, name, _fields(name, of, ego_from_camera[name], calibration, drive), where=where, camera=name
@@ -97,14 +98,22 @@ def read_rig(
         if name in used
     )
     text = "; ".join(
-        filter(None, (f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}", how, left_out))
+        filter(
+            None,
+            (
+                f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}",
+                how or poses_in_words(readings[0]),
+                left_out,
+            ),
+        )
     )
     ego_from_bev = _bev_frame(where)
     camera_rig = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
     findings = [Finding("calibration-read", "info", None, text)]
     if is_open := [name for name in used if cameras[name].lens_is_open]:
         findings.append(Finding("lens-assumed", "info", None, OPEN_LENS.format(calibration.name, ", ".join(is_open))))
-    return RigDraft(camera_rig, tuple(findings))
+    readings = readings if readings[0].states else ()
+    return RigDraft(camera_rig, tuple(findings), readings=readings, file=where)
 
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
@@ -120,10 +129,10 @@ def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
     )
 
 
-def _poses(
-    where: Path, cameras: Cameras, transform: Direction | None, height: ByCamera, yaw_deg: ByCamera
-) -> tuple[dict[str, Array], str]:
-    """ego_from_camera (4, 4) by camera, and how they were found."""
+def _readings(
+    where: Path, cameras: Cameras, stated: Mapping[str, str], height: ByCamera, yaw_deg: ByCamera
+) -> tuple[tuple[RigReading, ...], str]:
+    """What the poses of the cameras may be, and how they were found where no file states them."""
     pose_of = {name: of.pose for name, of in cameras.items() if of.pose is not None}
     lacking = [name for name in cameras if name not in pose_of]
     if not pose_of and height is not None:
@@ -131,7 +140,7 @@ def _poses(
         guessed, how = _guessed_poses(starts, height, yaw_deg)
         guessed_poses = {name: StatedPose({"": pose}, "ego_from_camera", exact=True) for name, pose in guessed.items()}
         linked = _along_chain({name: replace(of, pose=guessed_poses.get(name)) for name, of in cameras.items()})
-        return decide_poses(where, {name: of.pose for name, of in linked.items() if of.pose}, None)[0], how
+        return rig_readings(where, {name: of.pose for name, of in linked.items() if of.pose}, {}), how
     if lacking:
         why = "moves through the file, as in a reconstruction" if cameras[lacking[0]].moves else "is missing"
         raise InputError(
@@ -141,13 +150,22 @@ def _poses(
     if yaw_deg is not None:
         raise InputError(f"{where}: states the poses of the cameras: remove `yaw_deg` (`--yaw`)")
     heights = _by_camera(height, tuple(cameras), "height")
-    if transform is not None and all(pose.exact for pose in pose_of.values()):
-        raise InputError(f"{where}: states what its transforms mean: remove `transform` (`--transform`)")
-    poses, how = decide_poses(where, pose_of, transform, level_known=bool(heights))
-    yaws = ", ".join(f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°" for name, pose in poses.items())
+    if all(pose.exact for pose in pose_of.values()):
+        for name in stated:
+            raise InputError(f"{where}: states what its transforms mean: remove {named(RigOptions, name)}")
+    readings = rig_readings(where, pose_of, stated, height_stated=bool(heights))
     if heights:
-        poses, how = raised(poses, heights), f"{how}, raised to `height` (`--height`)"
-    return poses, f"{how}; yaw {yaws}"
+        readings = tuple(replace(each, ego_from_camera=raised(each.ego_from_camera, heights)) for each in readings)
+    return readings, ""
+
+
+def poses_in_words(reading: RigReading) -> str:
+    """A reading of a rig, and where its cameras look."""
+    yaws = ", ".join(
+        f"{name} {np.degrees(np.arctan2(pose[1, 2], pose[0, 2])):.0f}°"
+        for name, pose in reading.ego_from_camera.items()
+    )
+    return f"{reading.words() or 'poses as stated'}; yaw {yaws}"
 
 
 def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, drive: Path | None) -> Fields:

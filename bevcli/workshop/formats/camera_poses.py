@@ -1,8 +1,10 @@
-"""The meaning of the transforms of a calibration: direction and axes are decided by what is possible.
+"""The readings of the transforms of a calibration: direction, axes, kind of rotation and unit.
 
-The cameras of a vehicle are above the ground, their images are upright, and they look outwards.
+Those that no vehicle has are left out: its cameras are upright, look outwards, and where their names say. The images
+decide between the others (`bevcli.workshop.readings`).
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -13,15 +15,21 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z
+from bevcli.options import named
+from bevcli.sequences.files.readings import RigReading
+from bevcli.sequences.options import RigOptions
 
 Direction = Literal["ego_from_camera", "camera_from_ego"]
 DIRECTIONS: tuple[Direction, ...] = ("ego_from_camera", "camera_from_ego")
-HIGHEST_M = 4.0  # of a camera above the ground
+HEIGHTS_M = -3.0, 5.0  # of a camera above the origin, which may be at the roof
+EXTENT_M = 0.5, 12.0  # of the farthest camera from the origin, in the unit of its translations
+MOST_APART = 100  # times the median distance of the cameras from the origin
 STEEPEST_UP, STEEPEST_DOWN = 0.5, -0.9  # z of the viewing direction, the sine of its pitch
 LEAST_UPRIGHT = 0.5  # z of the direction that is up in the image
-INWARDS_M = (
-    0.05  # cameras look outwards: the mean of how far they lie in their own viewing direction, at least minus this
-)
+# Cameras look outwards: the mean of how far they lie in their own viewing direction, at least minus this.
+INWARDS_M = 0.05
+FARTHEST_OFF = np.radians(70)  # of a viewing direction from that of the camera's name
+SIDES = {"front|forward|ahead": 1, "back|rear": -1, "left": 1j, "right": -1j}  # in names, and where they are
 TOLERANCE = 1e-3
 Fields: TypeAlias = dict[str, Any]
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
@@ -30,17 +38,18 @@ AXES = {
     "vehicle": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
     "opengl": np.diag([1.0, -1.0, -1.0]),
 }
-AXES_TEXT = {
-    "optical": "x right, y down, z forward",
-    "vehicle": "x forward, y left, z up",
-    "opengl": "x right, y up, z backward",
+# (3, 3) ego_from_body: from a vehicle frame with other axes to x forward, y left, z up.
+EGO_FROM_BODY = {
+    "flu": np.eye(3),
+    "frd": np.diag([1.0, -1.0, -1.0]),
+    "rfu": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "rdf": AXES["vehicle"].T,
 }
-
-
-ORIGIN = (
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+HEIGHT = (
     "if the origin is not on the ground, pass `height=1.5` (`--height 1.5`), the mean height of the cameras above it"
 )
-ADVICE = {"below": ORIGIN, "height": ORIGIN, "unit": "convert the translations to metres"}
+ADVICE = {"height": HEIGHT, "unit": "pass `rig_unit` (`--rig-unit`), or convert the translations to metres"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +57,7 @@ class StatedPose:
     """A transform between a camera and the vehicle, as a file states it.
 
     Attributes:
-        matrices: (4, 4) by the order of a quaternion whose order is not known; the only one under "".
+        matrices: (4, 4) by what the numbers of a rotation may be (`rig_angles`); the only one under "".
         direction: that the name of the transform states; None for none.
         axes: of the camera frame, if they are known: a key of `AXES`.
         exact: the direction is certain, and so are the optical axes: nothing is decided.
@@ -67,13 +76,26 @@ class StatedPose:
         """The pose of another camera with optical axes, by that of this one."""
         return replace(self, then=self.then @ camera_from_other)
 
-    def ego_from_camera(self, reading: "Reading") -> Array:
-        """(4, 4) with optical axes, as a reading has it."""
-        matrix = self.matrices.get(reading.order, next(iter(self.matrices.values())))
+    def ego_from_camera(self, states: Mapping[str, str]) -> Array:
+        """(4, 4) with optical axes, as a reading states it."""
+        matrix, then = (
+            in_metres(each, states) for each in (self.matrices.get(states["rig_angles"], self.any_matrix), self.then)
+        )
         if self.exact:
-            return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ self.then
-        ego_from_axes = matrix if reading.direction == "ego_from_camera" else inverse(matrix)
-        return ego_from_axes @ inverse(rigid(rotation=AXES[reading.axes])) @ self.then
+            return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
+        body_from_axes = matrix if states["transform"] == "ego_from_camera" else inverse(matrix)
+        ego_from_body = rigid(rotation=EGO_FROM_BODY[states["rig_axes"]])
+        return ego_from_body @ body_from_axes @ inverse(rigid(rotation=AXES[states["camera_axes"]])) @ then
+
+    @property
+    def any_matrix(self) -> Array:
+        """(4, 4) of the first reading of its rotation."""
+        return next(iter(self.matrices.values()))
+
+
+def in_metres(matrix: Array, states: Mapping[str, str]) -> Array:
+    """A transform (4, 4) whose translation is in the unit that a reading states."""
+    return rigid(UNITS_M[states["rig_unit"]] * matrix[:3, 3], matrix[:3, :3])
 
 
 @dataclass(frozen=True)
@@ -102,79 +124,48 @@ class StatedCamera:
 Cameras: TypeAlias = dict[str, StatedCamera]
 
 
-@dataclass(frozen=True)
-class Reading:
-    """One of the ways to read the transforms of a rig."""
+def rig_readings(
+    where: Path, poses: Mapping[str, StatedPose], stated: Mapping[str, str | None], *, height_stated: bool = False
+) -> tuple[RigReading, ...]:
+    """The possible readings, the usual first. Raises InputError where there is none.
 
-    direction: Direction
-    axes: str
-    order: str
-
-    @property
-    def text(self) -> str:
-        """In words."""
-        order = f", quaternions {self.order}" if self.order else ""
-        return f"{self.direction}, camera axes {AXES_TEXT[self.axes]}{order}"
-
-
-def decide_poses(
-    where: Path, poses: Mapping[str, StatedPose], asked: Direction | None, *, level_known: bool = False
-) -> tuple[dict[str, Array], str]:
-    """ego_from_camera (4, 4) by camera, with optical axes, and how the transforms were read.
-
-    asked: the direction that the user states. level_known: the origin need not be on the ground, as heights are given.
-    Raises InputError where no reading is possible, or where several are and neither a name nor `asked` decides.
+    Args:
+        where: the file.
+        poses: by camera.
+        stated: options that state what the transforms are; None for those that are not given.
+        height_stated: the origin need not be on the ground, as the height of the cameras is given.
     """
     free = [pose for pose in poses.values() if not pose.exact]
     if not free:
-        exact = Reading("ego_from_camera", "optical", "")
-        return {name: pose.ego_from_camera(exact) for name, pose in poses.items()}, "poses as stated"
+        states = {"transform": "ego_from_camera", "rig_angles": "", "rig_unit": "m"}
+        return (RigReading({}, {name: pose.ego_from_camera(states) for name, pose in poses.items()}),)
     _check_rotations(where, poses)
-    rigs = {each: {name: pose.ego_from_camera(each) for name, pose in poses.items()} for each in _readings(free, asked)}
-    reasons = {reading: _impossible(rig, level_known=level_known) for reading, rig in rigs.items()}
-    possible = _distinct([reading for reading in rigs if not reasons[reading]], rigs)
-    named = next((pose.direction for pose in free if pose.direction), None)
-    fitting = [reading for reading in possible if reading.direction == named] or possible
-    _check_certain(f"{where}: {free[0].name}", fitting, reasons, named)
-    why = "as stated" if asked or len(possible) > 1 else "the only reading with the cameras on a vehicle"
-    if named and named != fitting[0].direction and not asked:
-        why += f"; its name says {named}"
-    return rigs[fitting[0]], f"{free[0].name} is {fitting[0].text} ({why})"
+    rigs = [
+        RigReading(states, {name: pose.ego_from_camera(states) for name, pose in poses.items()})
+        for states in _states(free, {name: value for name, value in stated.items() if value is not None})
+    ]
+    reasons = [_impossible(rig.ego_from_camera, height_stated=height_stated) for rig in rigs]
+    possible = _distinct([rig for rig, reason in zip(rigs, reasons, strict=True) if reason is None])
+    by_name = next((pose.direction for pose in free if pose.direction), None)
+    if possible and stated.get("transform") is None:
+        possible = [rig for rig in possible if rig.states["transform"] == by_name] or possible
+    if not possible:
+        _refuse(f"{where}: {free[0].name}", rigs, reasons)
+    return tuple(possible)
 
 
-def _check_certain(
-    where: str, chosen: list[Reading], reasons: Mapping[Reading, tuple[str, str] | None], named: Direction | None
-) -> None:
-    """Raise InputError unless one reading is chosen, and more than the sign of a height decides it.
-
-    reasons: why readings are impossible. named: the direction that a name states.
-    """
-    if not chosen:
-        nearest = min(reasons, key=lambda reading: (reasons[reading] or ("",))[0] not in ADVICE)
-        code, text = reasons[nearest] or ("", "")
-        raise InputError(
-            f"{where}: no reading of the transforms puts the cameras on a vehicle (expected above the ground, "
-            f"at most {HIGHEST_M:g} m high, upright, looking outwards); as {nearest.text}, {text}: "
-            f"{ADVICE.get(code, 'correct them, or pass `extrinsics` (`--extrinsics FILE`)')}"
-        )
-    first = chosen[0].direction
-    if any(reading.direction != first for reading in chosen):
-        raise InputError(
-            f"{where}: can be read in two directions, and both put the cameras on a vehicle: pass "
-            f'`transform="{DIRECTIONS[0]}"` (`--transform {DIRECTIONS[0]}`) or `transform="{DIRECTIONS[1]}"` '
-            f"(`--transform {DIRECTIONS[1]}`)"
-        )
-    if len(chosen) > 1:
-        raise InputError(
-            f"{where}: the order of the quaternions is not certain: name them rotation_wxyz or rotation_xyzw"
-        )
-    for other, reason in reasons.items():
-        if first != named and other.direction != first and reason and reason[0] == "below":  # the origin of a lidar?
-            raise InputError(
-                f"{where}: as {other.text}, {reason[1]}, and as {first} above it: pass "
-                f'`transform="{first}"` (`--transform {first}`); or `transform="{other.direction}"` (`--transform '
-                f"{other.direction}`) and `height=1.5` (`--height 1.5`)"
-            )
+def _refuse(where: str, rigs: Sequence[RigReading], reasons: Sequence[tuple[str, str] | None]) -> None:
+    """Raise InputError that says why the likeliest reading is impossible."""
+    codes = ["", "names", *ADVICE]  # the later, the likelier is all else right
+    ranks = [codes.index(reason[0]) if reason and reason[0] in codes else 0 for reason in reasons]
+    likeliest = int(np.argmax(ranks))
+    code, text = reasons[likeliest] or ("", "")
+    options = ", ".join(named(RigOptions, name) for name in ("transform", "rig_axes", "camera_axes", "rig_angles"))
+    raise InputError(
+        f"{where}: no reading of the transforms puts the cameras on a vehicle (expected upright, looking outwards, at "
+        f"most {HEIGHTS_M[1]:g} m high); as {rigs[likeliest].words()}, {text}: "
+        f"{ADVICE.get(code, f'correct them, state them by {options}, or pass `extrinsics` (`--extrinsics FILE`)')}"
+    )
 
 
 def _check_rotations(where: Path, poses: Mapping[str, StatedPose]) -> None:
@@ -189,25 +180,35 @@ def _check_rotations(where: Path, poses: Mapping[str, StatedPose]) -> None:
                 )
 
 
-def _readings(free: Sequence[StatedPose], asked: Direction | None) -> Iterator[Reading]:
-    """The ways to read transforms that are not exact. asked: the only direction."""
-    orders = sorted({order for pose in free for order in pose.matrices})
-    axes = next(((pose.axes,) for pose in free if pose.axes), ("optical", "vehicle"))
-    for direction, camera_axes, order in product((asked,) if asked else DIRECTIONS, axes, orders):
-        yield Reading(direction, camera_axes, order)
+def _states(free: Sequence[StatedPose], stated: Mapping[str, str]) -> Iterator[dict[str, str]]:
+    """What transforms that are not exact may be. stated: what they are."""
+    extent = max(float(np.linalg.norm(pose.any_matrix[:3, 3])) for pose in free)
+    units = [unit for unit, metres in UNITS_M.items() if EXTENT_M[0] <= extent * metres <= EXTENT_M[1]] or ["m"]
+    # A kind of rotation that not all cameras may have is none.
+    kinds = [kind for kind in free[0].matrices if all(kind in pose.matrices for pose in free)] or [""]
+    axes = next(([pose.axes] for pose in free if pose.axes), ["optical", "vehicle"])
+    choices: dict[str, Sequence[str]] = {
+        "transform": DIRECTIONS, "rig_axes": tuple(EGO_FROM_BODY), "camera_axes": axes, "rig_angles": kinds,
+        "rig_unit": units,
+    }  # fmt: skip
+    choices |= {name: [value] for name, value in stated.items()}
+    for values in product(*choices.values()):
+        yield dict(zip(choices, values, strict=True))
 
 
-def _distinct(readings: list[Reading], rigs: Mapping[Reading, Mapping[str, Array]]) -> list[Reading]:
+def _distinct(readings: Sequence[RigReading]) -> list[RigReading]:
     """Readings without those that mean the same as an earlier one."""
-    kept: list[Reading] = []
+    kept: list[RigReading] = []
     for reading in readings:
-        rig = rigs[reading]
-        if not any(all(np.allclose(rig[name], rigs[other][name], atol=1e-6) for name in rig) for other in kept):
+        rig = reading.ego_from_camera
+        if not any(
+            all(np.allclose(rig[name], other.ego_from_camera[name], atol=1e-3) for name in rig) for other in kept
+        ):
             kept.append(reading)
     return kept
 
 
-def _impossible(rig: Mapping[str, Array], *, level_known: bool) -> tuple[str, str] | None:
+def _impossible(rig: Mapping[str, Array], *, height_stated: bool) -> tuple[str, str] | None:
     """Why cameras cannot be on a vehicle: a code and a text. None if they can."""
     for name, pose in rig.items():
         forward, up = pose[:3, 2], -pose[:3, 1]
@@ -224,13 +225,32 @@ def _impossible(rig: Mapping[str, Array], *, level_known: bool) -> tuple[str, st
     if outwards < -INWARDS_M:
         return "inwards", f"the cameras look inwards, by {-outwards:.2f} m on average"
     for name, pose in rig.items():
-        if not level_known and not 0 < pose[2, 3] <= HIGHEST_M:
-            if pose[2, 3] > 100 * HIGHEST_M:
+        side = side_of(name)
+        yaw = np.angle(complex(*pose[:2, 2]))
+        if side and abs(np.angle(np.exp(1j * yaw) / side)) > FARTHEST_OFF:
+            return "names", f"{name} looks to {np.degrees(yaw):.0f}°"
+    farthest = max(rig, key=lambda name: float(np.linalg.norm(rig[name][:3, 3])))
+    extents = [float(np.linalg.norm(pose[:3, 3])) for pose in rig.values()]
+    if max(extents) > MOST_APART * np.median(extents) > 0:
+        return "unit", f"{farthest} is {max(extents) / np.median(extents):.0f} times as far away (in millimetres?)"
+    for name, pose in rig.items():
+        if not height_stated and not HEIGHTS_M[0] < pose[2, 3] <= HEIGHTS_M[1]:
+            if pose[2, 3] > 100 * HEIGHTS_M[1]:
                 return "unit", f"{name} is {pose[2, 3]:.0f} m above the origin (in millimetres?)"
-            if pose[2, 3] <= 0:
-                return "below", f"{name} is {-pose[2, 3]:.2f} m below the origin"
             return "height", f"{name} is {pose[2, 3]:.2f} m above the origin"
     return None
+
+
+def side_of(camera: str) -> complex:
+    """The viewing direction that the name of a camera states, forward + 1j left; 0 for none.
+
+    Left and right alone may be the two cameras of a stereo pair.
+    """
+    ahead, left = (
+        sum(side for words, side in SIDES.items() if re.search(words, camera.lower()) and (side.imag != 0) == is_left)
+        for is_left in (False, True)
+    )
+    return complex(ahead + left) if ahead else 0j
 
 
 def raised(poses: Mapping[str, Array], heights: Mapping[str, float]) -> dict[str, Array]:

@@ -23,6 +23,7 @@ from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, 
 from bevcli.workshop.formats.autoware import urdf_document, with_own_names
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
+from bevcli.workshop.formats.pose_readings import quaternions_of_angles
 from bevcli.workshop.formats.waymo import with_intrinsics_by_name
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
@@ -37,8 +38,10 @@ SIZE = ("resolution", "imagesize", "size")
 FOCAL = ("f", "focallength")
 TRANSFORM = ("t", "extrinsics", "extrinsic", "transform", "transformmatrix", "pose", "rt", "extrinsicmatrix")
 ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "quaternion", "quaternionwxyz",
-            "quaternionxyzw", "q", "qvec", "rvec", "orientation")  # fmt: skip
-TRANSLATION = ("translation", "t", "position", "tvec", "location")
+            "quaternionxyzw", "q", "qvec", "rvec", "orientation", "rpy", "euler", "eulerangles")  # fmt: skip
+ANGLES = ("roll", "pitch", "yaw")
+TRANSLATION = ("translation", "t", "position", "tvec", "location", "xyz")
+LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 CAMERA_FRAMES = r"camera\d*|cam\d*|sensor|c"
 EGO_FRAMES = "ego|vehicle|car|base|body|imu|rig|world|lidar|velo|b"
 EXACT: dict[str, Direction] = {"egofromcamera": "ego_from_camera", "camerafromego": "camera_from_ego"}
@@ -135,7 +138,7 @@ def _is_camera(entry: Any) -> bool:
     """True for a mapping with intrinsics or a pose."""
     if not isinstance(entry, dict):
         return False
-    names = {*INTRINSICS, "fx", *EXACT, *TRANSFORM, *ROTATION}
+    names = {*INTRINSICS, "fx", *EXACT, *TRANSFORM, *ROTATION, *ANGLES}
     return any(_plain(key) in names or _direction_of(str(key)) is not None for key in entry)
 
 
@@ -282,6 +285,7 @@ def _matrices(value: Any) -> dict[str, Array]:
         value = value["data"]
     if isinstance(value, dict):
         plain = {_plain(key): item for key, item in value.items()}
+        plain = _with_vectors(plain)
         rotation = next(((name, plain[name]) for name in ROTATION if plain.get(name) is not None), None)
         # Under "T" and "t", a translation has three numbers.
         translation = next(
@@ -298,6 +302,12 @@ def _matrices(value: Any) -> dict[str, Array]:
     return {"": matrix} if np.allclose(matrix[3], [0, 0, 0, 1]) else {}
 
 
+def _with_vectors(plain: Fields) -> Fields:
+    """A mapping whose x, y, z, roll, pitch and yaw are one translation and one rotation."""
+    vectors = {"rpy": [plain.get(name) for name in ANGLES], "xyz": [plain.get(name) for name in "xyz"]}
+    return plain | {name: numbers for name, numbers in vectors.items() if None not in numbers}
+
+
 def _numbers(value: Any) -> Array | None:
     if isinstance(value, dict):
         value = value.get("data", [value.get(axis) for axis in "xyz"])
@@ -308,15 +318,29 @@ def _rotations(name: str, value: Any) -> dict[str, Array]:
     """(3, 3) rotations by the order of the quaternion; "" where there is one."""
     if isinstance(value, dict) and {"w", "x", "y", "z"} <= value.keys():
         name, value = "rotationwxyz", [value[axis] for axis in "wxyz"]
+    if isinstance(value, dict) and {*ANGLES} <= value.keys():
+        name, value = "rpy", [value[angle] for angle in ANGLES]
     array = _numbers(value)
     if array is None:
         return {}
     if array.size == 9:
         return {"": array.reshape(3, 3)}
     if array.size == 3:
-        return {"": np.asarray(cv2.Rodrigues(array.ravel())[0], dtype=np.float64)}
+        return _rotations_of_three(name, array.ravel())
     if array.size != 4 or abs(np.linalg.norm(array) - 1) > 0.01:
         return {}
     orders = {"wxyz": array.ravel(), "xyzw": np.roll(array.ravel(), 1)}
     possible = {order for order in orders if name.endswith(order)} or ({"wxyz"} if name == "qvec" else set(orders))
     return {order if len(possible) > 1 else "": rotation_from_quaternion(orders[order]) for order in sorted(possible)}
+
+
+def _rotations_of_three(name: str, numbers: Array) -> dict[str, Array]:
+    """(3, 3) rotations by what three numbers may be: a rotation vector, or roll, pitch and yaw in either unit."""
+    rotations, largest = {}, float(np.abs(numbers).max())
+    if largest <= LARGEST_RADIANS and name not in ("rpy", "euler", "eulerangles"):
+        rotations["vector"] = np.asarray(cv2.Rodrigues(numbers)[0], dtype=np.float64)
+    if name not in ("rvec", "r"):
+        for unit, angles in (("radians", numbers), ("degrees", np.radians(numbers))):
+            if largest <= LARGEST_RADIANS or unit == "degrees":
+                rotations[unit] = rotation_from_quaternion(quaternions_of_angles(*angles[:, None])[0])
+    return rotations

@@ -1,100 +1,84 @@
-"""The choice between readings of a file of poses, such as degrees or radians: a vehicle is level and drives forward."""
+"""Readings of a file of poses: which body they are of, and in which direction. A vehicle drives along its x axis."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera
-from bevcli.geometry.transforms import Array, Pose, rotation_from_quaternion
-from bevcli.sequences.files.ego_motion_file import DrivePoses
+from bevcli.geometry.transforms import Array, Pose, inverse, rigid
+from bevcli.sequences.files.readings import PoseReading
+from bevcli.workshop.formats.camera_poses import EGO_FROM_BODY
 
-MOVING_M_S, MOVING_M = 1.0, 5.0  # slower steps, and drives with less distance, show no direction
+MOVING_M_S, MOVING_M = 1.0, 2.0  # slower steps, and drives with less distance, show no direction
 STEP_S = 0.2  # between two compared poses: shorter steps are noise
-LARGEST_MISFIT_DEG = 20.0
-SAME_DEG = 1.0  # readings that differ less are the same
+FASTEST_M_S = 80.0
+ASIDE = np.radians(25.0)  # largest angle between x and the direction of motion, on average
+LEVEL = 0.9  # cosine of the largest tilt of a vehicle in a world with z up
+VEHICLE_AXES = ("flu", "frd", "rfu")
 
 
-@dataclass(frozen=True)
-class Reading:
-    """T poses, as a file may mean them. words: for the user; "" where there is nothing to say."""
+def of_bodies(
+    positions: Array, rotations: Mapping[str, Array], cameras: Sequence[str], stated: Mapping[str, str | None]
+) -> Iterator[PoseReading]:
+    """The readings of poses, the usual first.
 
-    words: str
-    translations: Array  # (T, 3) metres, world frame
-    quaternions: Array  # (T, 4) w, x, y, z, norm 1
-
-    def misfit_deg(self, times_ns: NDArray[np.int64]) -> tuple[float, bool]:
-        """The larger of tilt and angle between x and the direction of motion, medians; whether the vehicle moves."""
-        seconds = (times_ns - times_ns[0]) / 1e9
-        period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else STEP_S
-        rows = np.arange(0, len(seconds), max(1, round(STEP_S / period)))
-        rotations = np.stack([rotation_from_quaternion(q) for q in self.quaternions[rows]])
-        tilt = float(np.degrees(np.median(np.arccos(np.clip(rotations[:, 2, 2], -1, 1)))))
-        steps = np.diff(self.translations[rows], axis=0)
-        lengths = np.linalg.norm(steps, axis=1)
-        moving = lengths > MOVING_M_S * np.diff(seconds[rows])
-        if lengths[moving].sum() < MOVING_M:
-            return tilt, False
-        in_ego = np.einsum("tji,tj->ti", rotations[:-1], steps)[moving]
-        aside = np.degrees(np.abs(np.arctan2(np.linalg.norm(in_ego[:, 1:], axis=1), in_ego[:, 0])))
-        return max(tilt, float(np.median(aside))), True
-
-    def differs_from(self, other: "Reading") -> bool:
-        """Whether the vehicle turns otherwise, beyond `SAME_DEG`, as the world's own orientation is arbitrary."""
-        turns = [product(conjugate(reading.quaternions[:1]), reading.quaternions) for reading in (self, other)]
-        cosines = np.abs(np.sum(turns[0] * turns[1], axis=1)).clip(0, 1)
-        return bool(np.degrees(2 * np.arccos(cosines)).max() > SAME_DEG)
-
-
-def best_reading(
-    path: Path, readings: Sequence[Reading], times_ns: NDArray[np.int64], ask: str, drive: DrivePoses
-) -> Reading:
-    """The reading that fits a vehicle, the first one of those that fit as well.
-
-    ask: what the user may pass where the poses do not decide; "" where the first reading is the usual one.
-    Raises InputError, also where the poses fit a camera that looks ahead, and not the vehicle.
+    Args:
+        positions: (T, 3) metres.
+        rotations: (T, 4) quaternions w, x, y, z by the value of `pose_angles`, "" where that is certain.
+        cameras: whose poses they may be, beside the vehicle's; in the order in which they are tried.
+        stated: the options that state a reading; None for those that are not given.
     """
-    fits = [reading.misfit_deg(times_ns) for reading in readings]
-    misfits, moves = [misfit for misfit, _ in fits], fits[0][1]
-    least, first = min(misfits), readings[0]
-    decided = least <= LARGEST_MISFIT_DEG and (moves or not any(first.differs_from(other) for other in readings[1:]))
-    if ask and len(readings) > 1 and not decided:
-        words = " or ".join(each.words for each in readings)
-        why = f"none fits how the vehicle moves, the best is {least:.0f}° off" if moves else "the vehicle does not move"
-        raise InputError(f"{path}: may have {words}; {why}, which would decide: pass {ask}")
-    if least > LARGEST_MISFIT_DEG:
-        _refuse_poses_of_camera(path, first, times_ns, drive)
-        return first
-    return next(each for each, misfit in zip(readings, misfits, strict=True) if misfit <= least + SAME_DEG)
+    bodies = [{"pose_axes": axes, "poses_of": "vehicle"} for axes in VEHICLE_AXES]
+    bodies += [{"poses_of": camera} for camera in cameras]
+    for angles, quaternions in rotations.items():
+        for transform in ("world_from_body", "body_from_world"):
+            at, turned = positions, quaternions
+            if transform == "body_from_world":
+                turned = conjugate(quaternions)
+                at = -rotated(turned, positions)
+            for body in bodies:
+                states = {"pose_angles": angles, "pose_transform": transform, **body}
+                if all(value is None or states.get(name, value) == value for name, value in stated.items()):
+                    axes = body.get("pose_axes")
+                    poses = of_ego(at, turned, rigid(rotation=EGO_FROM_BODY[axes])) if axes else (at, turned)
+                    yield PoseReading(states, *poses, camera="" if axes else body["poses_of"])
 
 
-def _refuse_poses_of_camera(path: Path, reading: Reading, times_ns: NDArray[np.int64], drive: DrivePoses) -> None:
-    for camera in drive.cameras_ahead if drive.stated.poses_of is None else ():
-        if min(candidate.misfit_deg(times_ns)[0] for candidate in of_vehicle(reading, camera)) <= LARGEST_MISFIT_DEG:
-            raise InputError(
-                f"{path}: the poses are not those of the vehicle (x forward, z up), but fit a camera that looks ahead: "
-                f"pass `poses_of={camera.name}` (`--poses-of {camera.name}`), or `poses_of=vehicle` (`--poses-of "
-                "vehicle`) to keep them"
-            )
+def of_ego(translations: Array, quaternions: Array, ego_from_body: Array) -> tuple[Array, Array]:
+    """The vehicle's translations (T, 3) and quaternions (T, 4) from those of a body on it, (4, 4) ego_from_body.
 
-
-def of_vehicle(reading: Reading, camera: Camera) -> list[Reading]:
-    """The vehicle's poses from those of its camera, in the two usual worlds: with z up, and the first camera's frame.
-
-    The second world becomes the frame of the vehicle at that pose.
+    The world has z up: it is that of the poses, or the frame of the vehicle where the body was the world, or at the
+    first pose.
     """
-    camera_from_ego = Pose.from_matrix(camera.camera_from_ego)
-    translations = reading.translations + rotated(reading.quaternions, camera_from_ego.translation)
-    quaternions = product(reading.quaternions, camera_from_ego.quaternion[None])
-    ego_from_camera = Pose.from_matrix(camera.ego_from_camera)
-    turned = rotated(ego_from_camera.quaternion[None], translations) + ego_from_camera.translation
-    return [
-        Reading(reading.words, turned, product(ego_from_camera.quaternion[None], quaternions)),
-        Reading(reading.words, translations, quaternions),
-    ]
+    body, pose = Pose.from_matrix(inverse(ego_from_body)), Pose.from_matrix(ego_from_body)
+    at, turned = translations + rotated(quaternions, body.translation), product(quaternions, body.quaternion[None])
+    if is_level(turned):
+        return at, turned
+    around = rotated(pose.quaternion[None], at) + pose.translation, product(pose.quaternion[None], turned)
+    if is_level(around[1]):
+        return around
+    back = conjugate(turned[:1])
+    return rotated(back, at - at[0]), product(back, turned)
+
+
+def is_level(quaternions: Array) -> bool:
+    """True where z of a vehicle with these rotations points up in the world."""
+    return float(np.median(rotated(quaternions, np.array([0.0, 0.0, 1.0]))[:, 2])) > LEVEL
+
+
+def drives_along_x(translations: Array, quaternions: Array, times_ns: NDArray[np.int64]) -> bool:
+    """False for a vehicle that moves aside, or faster than vehicles do; True for one that hardly moves."""
+    seconds = (times_ns - times_ns[0]) / 1e9
+    period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else STEP_S
+    rows = np.arange(0, len(seconds), max(1, round(STEP_S / period)))
+    steps, durations = np.diff(translations[rows], axis=0), np.diff(seconds[rows])
+    lengths = np.linalg.norm(steps, axis=1)
+    moving = lengths > MOVING_M_S * durations
+    if lengths[moving].sum() < MOVING_M:
+        return True
+    in_ego = rotated(conjugate(quaternions[rows][:-1][moving]), steps[moving])
+    aside = np.arctan2(np.linalg.norm(in_ego[:, 1:], axis=1), np.abs(in_ego[:, 0]))
+    return bool(np.median(lengths[moving] / durations[moving]) < FASTEST_M_S and np.median(aside) < ASIDE)
 
 
 def quaternions_of_angles(roll: Array, pitch: Array, yaw: Array) -> Array:

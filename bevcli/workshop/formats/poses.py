@@ -1,14 +1,13 @@
 """The vehicle's poses in files of other programs: TUM, KITTI, EuRoC, and tables with named columns, of GPS too.
 
-The kind of a file follows from its contents: its names of columns, or their number. What its numbers mean (the unit of
-times, degrees or radians, the order of a quaternion) follows from them, from the times of the frames, and from the
-direction in which the vehicle moves: a vehicle is level and drives forward. A note says what was understood. Where two
-readings are left, an error asks.
+The kind of a file follows from its contents: its names of columns, or their number. What its numbers mean (degrees or
+radians, the order of a quaternion, the body and the direction of the poses) are readings between which the images
+decide; the unit of times follows from the times of the frames. A note says what was understood.
 """
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -18,24 +17,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin, quaternion_from_rotation
 from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
 from bevcli.parsing.files import is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
+from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.native import TimeKind
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.oxts import read_oxts
-from bevcli.workshop.formats.pose_readings import Reading, best_reading, of_vehicle, quaternions_of_angles
+from bevcli.workshop.formats.pose_readings import (
+    FASTEST_M_S,
+    drives_along_x,
+    of_bodies,
+    of_ego,
+    quaternions_of_angles,
+)
 from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, TUM, VECTOR, Table, read_table
 from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
-FASTEST_M_S = 100.0
-COUNTER_CLOCKWISE, CLOCKWISE = "counter-clockwise from x", "clockwise from north"
+ANGLES = ("radians", "degrees", "compass", "compass-radians")
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
 
@@ -82,21 +87,41 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     for row, before, time in zip(table.rows[1:], times[:-1], times[1:], strict=True):
         if time <= before:
             raise InputError(f"{path}: line {row.line}: its time is not later than that of the row before: sort them")
-    camera, of = _camera(path, KINDS[name], drive)
-    readings, ask = _readings(table, positions, drive)
-    if camera is not None:
-        readings = [candidate for reading in readings for candidate in of_vehicle(reading, camera)]
-    best = best_reading(path, readings, times, ask, drive)
+    _check_camera(drive)
+    readings = [each for each in _readings(table, positions, KINDS[name], drive) if _is_possible(each, times, drive)]
+    if not readings:
+        raise InputError(
+            f"{path}: in no reading of the poses the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
+            "correct them, or measure the motion by `odometry=True` (`--odometry`)"
+        )
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
-    words = (f"{name}, {counted(len(times), 'rows')}{rate}", time_words, *table.notes, best.words, of)
-    note = f"poses: {', '.join(word for word in words if word)}"
+    first = f"{name}, {counted(len(times), 'rows')}{rate}, {time_words}"
+    first = ", ".join([first, *table.notes])
+    last = ""
     if drive.times_ns is not None:
         covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
         count = len(drive.times_ns)
-        note += f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
-    kinematics = derive_kinematics(times, best.translations, best.quaternions)
-    poses = (times, best.translations, best.quaternions)
-    return ReadPoses(EgoMotion(*poses, *kinematics, velocities_are_stated=False), (note,), origin)
+        last = f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
+    readings = [replace(each, note=f"poses: {first}, {each.words()}{last}") for each in readings]
+    return replace(of_reading(readings[0], times, drive.rig), geo_origin=origin, readings=tuple(readings), file=path)
+
+
+def of_reading(reading: PoseReading, times_ns: NDArray[np.int64], rig: CameraRig) -> ReadPoses:
+    """The poses of the vehicle with a rig, as a reading has them."""
+    poses = _poses_of_ego(reading, rig)
+    kinematics = derive_kinematics(times_ns, *poses)
+    return ReadPoses(EgoMotion(times_ns, *poses, *kinematics, velocities_are_stated=False), (reading.note,))
+
+
+def _poses_of_ego(reading: PoseReading, rig: CameraRig) -> tuple[Array, Array]:
+    """Translations (T, 3) and quaternions (T, 4) of the vehicle."""
+    poses = reading.translations, reading.quaternions
+    return of_ego(*poses, rig[reading.camera].ego_from_camera) if reading.camera else poses
+
+
+def _is_possible(reading: PoseReading, times_ns: NDArray[np.int64], drive: DrivePoses) -> bool:
+    """False where the vehicle does not drive along its x axis."""
+    return drive.rig_is_open or drives_along_x(*_poses_of_ego(reading, drive.rig), times_ns)
 
 
 def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
@@ -199,46 +224,49 @@ def _covered(first: Decimal | int, last: Decimal | int, times_ns: NDArray[np.int
     return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
 
 
-def _camera(path: Path, layout: Kind, drive: DrivePoses) -> tuple[Camera | None, str]:
-    """The camera whose poses the file has, None for the vehicle; and the words for that."""
-    cameras = drive.rig.cameras
-    if drive.stated.poses_of == "vehicle" or (drive.stated.poses_of is None and not layout.of_camera):
-        return None, "of the vehicle"
-    if drive.stated.poses_of is not None:
-        named = next((camera for camera in cameras if camera.name == drive.stated.poses_of), None)
-        if named is None:
-            expected = ", ".join(("vehicle", *drive.rig.names))
-            raise InputError(
-                f"`poses_of={drive.stated.poses_of}` (`--poses-of`): is not in the rig (expected one of {expected})"
-            )
-        return named, f"of {named.name}"
-    zeroth = [camera for camera in cameras if re.search("(?<![0-9])0+$", camera.name)] or drive.cameras_ahead
-    if not zeroth:
+def _check_camera(drive: DrivePoses) -> None:
+    if drive.stated.poses_of not in (None, "vehicle", *drive.rig.names):
+        expected = ", ".join(("vehicle", *drive.rig.names))
         raise InputError(
-            f"{path}: KITTI's poses are those of its camera 0, and no camera looks ahead: pass `poses_of` "
-            "(`--poses-of`)"
+            f"`poses_of={drive.stated.poses_of}` (`--poses-of`): is not in the rig (expected one of {expected})"
         )
-    return zeroth[0], f"of camera 0, as KITTI's are ({zeroth[0].name})"
 
 
-def _readings(table: Table, positions: Array, drive: DrivePoses) -> tuple[list[Reading], str]:
-    """The possible poses, the usual one first; and what the user may pass to choose, "" where the first is usual."""
+def _readings(table: Table, positions: Array, kind: Kind, drive: DrivePoses) -> Iterator[PoseReading]:
+    """What the poses may be, the usual first: those of KITTI are of its camera 0."""
+    rotations, cameras = _rotations(table, drive), list(drive.rig.names)
+    stated = {name: getattr(drive.stated, name) for name in ("poses_of", "pose_axes", "pose_transform")}
+    if stated["pose_axes"] is not None:
+        stated["poses_of"] = "vehicle"
+    of_gps = table.has("latitude", "longitude")
+    if of_gps or not (table.has(*QUATERNION) or table.has(*MATRIX)):  # angles are those of a vehicle in the world
+        cameras, stated["pose_transform"] = [], stated["pose_transform"] or "world_from_body"
+    if of_gps:
+        stated["pose_axes"] = stated["pose_axes"] or "flu"
+    readings = of_bodies(positions, rotations, cameras, stated)
+    zeroth = next((name for name in cameras if re.search("(?<![0-9])0+$", name)), "")
+    zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
+    yield from sorted(readings, key=lambda each: kind.of_camera and each.camera != zeroth)
+
+
+def _rotations(table: Table, drive: DrivePoses) -> dict[str, Array]:
+    """(T, 4) quaternions by the value of `pose_angles`; "" where there is one reading."""
     if table.has(*MATRIX):
         matrices = table.numbers(*MATRIX).reshape(-1, 3, 4)[..., :3]
         errors = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        if errors.max() > ROTATION_TOLERANCE:
-            row = table.rows[int((errors > ROTATION_TOLERANCE).argmax())]
+        if errors.max() > ROTATION_TOLERANCE or np.linalg.det(matrices).min() < 0:
+            row = table.rows[int(((errors > ROTATION_TOLERANCE) | (np.linalg.det(matrices) < 0)).argmax())]
             raise InputError(f"{row.path}: line {row.line}: the first three columns of its matrix are no rotation")
-        return [Reading("", positions, np.stack([quaternion_from_rotation(matrix) for matrix in matrices]))], ""
+        return {"": np.stack([quaternion_from_rotation(matrix) for matrix in matrices])}
     if table.has(*QUATERNION):
-        return _readings_of_quaternions(table, positions), ""
+        return _of_quaternions(table, drive)
     if table.has("yaw") or table.has("heading"):
-        return _readings_of_angles(table, positions, drive)
+        return _of_angles(table, drive)
     names = "qw, qx, qy, qz; yaw; or heading"
     raise InputError(f"{table.path}: columns of the orientation are missing (expected {names})")
 
 
-def _readings_of_quaternions(table: Table, positions: Array) -> list[Reading]:
+def _of_quaternions(table: Table, drive: DrivePoses) -> dict[str, Array]:
     """The quaternions of a file with names, and both orders of one without."""
     quaternions = table.numbers(*QUATERNION)
     norms = np.linalg.norm(quaternions, axis=1)
@@ -248,41 +276,34 @@ def _readings_of_quaternions(table: Table, positions: Array) -> list[Reading]:
         message = f"the quaternion's norm is {norms[row]:.6g} (expected 1): check its digits"
         raise table.rows[row].error("qw..qz", message)
     quaternions = quaternions / norms[:, None]
-    order = [name for name in table.columns if name in QUATERNION]
-    readings = [Reading(f"quaternion {' '.join(name[1] for name in order)}", positions, quaternions)]
+    order = "wxyz" if next(name for name in table.columns if name in QUATERNION) == "qw" else "xyzw"
+    orders = {order: quaternions}
     if not table.columns["qw"]:
-        first = order[0] == "qw"
-        other = np.roll(quaternions, 1 if first else -1, axis=1)
-        readings.append(Reading(f"quaternion {'x y z w' if first else 'w x y z'}", positions, other))
-    return readings
+        first = order == "wxyz"
+        orders["xyzw" if first else "wxyz"] = np.roll(quaternions, 1 if first else -1, axis=1)
+    return {name: orders[name] for name in orders if drive.stated.pose_angles in (None, name)} or orders
 
 
-def _readings_of_angles(table: Table, positions: Array, drive: DrivePoses) -> tuple[list[Reading], str]:
+def _of_angles(table: Table, drive: DrivePoses) -> dict[str, Array]:
     """Degrees or radians, counter-clockwise from x or clockwise from y, which is north."""
     name = "heading" if table.has("heading") else "yaw"
     if table.has("heading", "yaw"):
         raise InputError(f"{table.path}: has a column of yaw and one of heading: remove one")
-    angles, heading, of_gps = table.numbers("roll", "pitch", name), table.columns[name], table.has("latitude")
-    units = ["radians", "degrees"]
-    if drive.stated.pose_angles is not None:
-        units = ["degrees" if drive.stated.pose_angles == "compass" else drive.stated.pose_angles]
-    elif mark := re.search(r"[_\[( ](deg|rad)", heading):
-        units = [unit for unit in units if unit.startswith(mark[1])]
-    elif np.abs(angles).max() > LARGEST_RADIANS:
-        units = ["degrees"]
-    turns = [COUNTER_CLOCKWISE, CLOCKWISE]
-    if drive.stated.pose_angles == "compass":
-        turns = [CLOCKWISE]
-    elif name == "yaw" and not of_gps:
-        turns = [COUNTER_CLOCKWISE]
-    usual = name == "heading" and of_gps  # degrees clockwise from north
-    readings = []
-    for turn in reversed(turns) if usual else turns:
-        for unit in reversed(units) if usual else units:
-            roll, pitch, yaw = (np.radians(angles) if unit == "degrees" else angles).T
-            if turn == CLOCKWISE:
-                pitch, yaw = -pitch, np.pi / 2 - yaw
-            words = f"{name} in {unit} {turn}"
-            readings.append(Reading(words, positions, quaternions_of_angles(roll, pitch, yaw)))
-    names = ["degrees", "radians", *(["compass"] if name == "heading" or of_gps else [])]
-    return readings, "" if usual else " or ".join(f"`pose_angles={unit_name}` (`--pose-angles`)" for unit_name in names)
+    angles, of_gps = table.numbers("roll", "pitch", name), table.has("latitude")
+    kinds = ["radians", "degrees"]
+    if name == "heading" or of_gps:
+        kinds += ["compass", "compass-radians"]
+    if name == "heading" and of_gps:
+        kinds.reverse()
+        kinds.sort(key=lambda kind: kind != "compass")
+    if mark := re.search(r"[_\[( ](deg|rad)", table.columns[name]):
+        kinds = [kind for kind in kinds if ("rad" in kind) == (mark[1] == "rad")]
+    if np.abs(angles).max() > LARGEST_RADIANS:
+        kinds = [kind for kind in kinds if "rad" not in kind]
+    rotations = {}
+    for kind in [drive.stated.pose_angles] if drive.stated.pose_angles in ANGLES else kinds:
+        roll, pitch, yaw = (angles if "rad" in kind else np.radians(angles)).T
+        if kind.startswith("compass"):
+            pitch, yaw = -pitch, np.pi / 2 - yaw
+        rotations[kind] = quaternions_of_angles(roll, pitch, yaw)
+    return rotations

@@ -10,7 +10,7 @@ from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
 from bevcli.sequences.images import FrameEntry, ListedDrive, bev_frame_notes
 from bevcli.sequences.native import FolderOptions
-from bevcli.sequences.native.folder import check_covered
+from bevcli.sequences.native.folder import check_covered, decided
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import rotation_notes
 from bevcli.workshop.formats.calibrations import SEVERAL
@@ -41,7 +41,7 @@ def open_video(path: Path, common: InputOptions, options: FolderOptions) -> List
     understood = f"{len(entries)} images {rate} from {start} on"
     poses = ReadPoses(None)
     if options.ego_motion_file is not None and common.ego_motion != "static":
-        poses = read_poses(options.ego_motion_file, DrivePoses(rig, options, video.times_ns))
+        poses = read_poses(options.ego_motion_file, DrivePoses(rig, options, video.times_ns, bool(draft.readings)))
     elif common.ego_motion == "required":
         raise InputError(
             f"{path}: a video has no poses of the vehicle: pass `ego_motion_file` (`--ego-motion FILE`), "
@@ -54,6 +54,9 @@ def open_video(path: Path, common: InputOptions, options: FolderOptions) -> List
         check_covered(
             options.ego_motion_file, poses, entries, "state the time of the first image by `start_ns` (`--start-ns`)"
         )
+    images = ListedDrive(path.parent, common, rig, entries, None)
+    draft, poses = decided(replace(draft, rig=rig), poses, images, options)
+    rig, motion = draft.rig, poses.motion
     assumed = bev_frame_notes(rig, "the calibration")
     notes = (*draft.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
     if motion is None and common.ego_motion != "measured":

@@ -25,8 +25,9 @@ from bevcli.parsing.files import is_there
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.printing import one_line
 from bevcli.sequences import images
-from bevcli.sequences.files.calibration_file import CALIBRATION, draft_of, draft_rig
-from bevcli.sequences.files.ego_motion_file import DrivePoses
+from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_of, draft_rig
+from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
+from bevcli.sequences.native.folder import decided
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
@@ -227,23 +228,30 @@ def open_bag(path: Path, common: InputOptions, options: BagOptions) -> images.Li
     used_rig = replace(used_rig, cameras=tuple(each for each in used_rig.cameras if each.name in with_images))
     entries = _entries(bag, finder.cameras)
     frame_times = np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64)
-    drive_poses = DrivePoses(used_rig, options, frame_times)
-    motion, source, motion_notes = reader.motion(common.ego_motion, file, drive_poses)
+    anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
+    source, draft = "", draft or RigDraft(used_rig, ())
+    if file is not None and common.ego_motion != "static":
+        poses = read_poses(file, DrivePoses(used_rig, options, frame_times, bool(draft.readings)))
+    else:
+        motion, source, motion_notes = reader.motion(common.ego_motion)
+        poses = ReadPoses(motion, motion_notes)
+    entries, gaps = _covered(entries, poses.motion, path)
+    any_rig = images.ListedDrive(path, anywhere, used_rig, entries, None)
+    draft, poses = decided(replace(draft, rig=used_rig), poses, any_rig, options)
+    used_rig, motion = draft.rig, poses.motion
     geo_origin = facts.geo_origin or find_geo_origin(bag, motion)
-    entries, gaps = _covered(entries, motion, path)
     notes = (
         finder.table(source),
-        *(() if draft is None else draft.notes),
+        *draft.notes,
         *bag.notes,
         *beside,
         *reader.notes,
         *([f"without images, left out: {', '.join(lost)}"] if lost else []),
         *(f"{name} is not used: no CameraInfo belongs to it" for name in finder.left_out),
         *images.bev_frame_notes(used_rig, "the calibration" if rig else "a bag"),
-        *motion_notes,
+        *poses.notes,
         *gaps,
     )
-    anywhere = replace(common, allow_outside=True)  # images are messages, not files below a folder
     sequence = images.ListedDrive(path, anywhere, used_rig, entries, motion, notes=notes, input_files=bag.file_paths)
     sequence.facts = replace(facts, geo_origin=geo_origin)
     if path.is_file():

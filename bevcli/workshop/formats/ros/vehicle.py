@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial, reduce
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.files import MIB
-from bevcli.sequences.files.ego_motion_file import DrivePoses, read_poses
 from bevcli.sequences.options import EgoMotionUse
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, StatedTopics, TopicFinder, spread
 from bevcli.workshop.formats.ros.messages import Transform, camera_of, frame_of, pose_of, timestamp_ns, transforms_of
@@ -318,20 +316,13 @@ class VehicleReader:
             )
         return ego_from_frame
 
-    def motion(
-        self, use: EgoMotionUse, file: Path | None, drive: DrivePoses
-    ) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
-        """The poses of a file, a topic or the transforms, None without any; their topic, "" for none; and notes.
-
-        file: of poses in place of what the bag has. drive: what its reader needs to know.
+    def motion(self, use: EgoMotionUse) -> tuple[EgoMotion | None, str, tuple[str, ...]]:
+        """The poses of a topic or the transforms, None without any; their topic, "" for none; and notes.
 
         Raises InputError if poses are required and not found.
         """
         if use == "static":
             return None, "", ("the vehicle is assumed to stand still (poses in the bag are not read)",)
-        if file is not None:
-            poses = read_poses(file, drive)
-            return poses.motion, "", poses.notes
         ego_frame = self.ego_frame or next((name for name in EGO_FRAMES if name in self._tree.frames), EGO_FRAMES[0])
         topic = self._finder.pose_topic()
         if topic is not None:

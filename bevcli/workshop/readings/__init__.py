@@ -1,0 +1,10 @@
+"""The images decide between the readings of a rig and of poses.
+
+In the order of the work:
+    pairs         two frames between which the vehicle moved: points of each camera that match, and the images
+    residuals     how far matched points are from where a reading puts them
+    heights       how high the cameras are above the road, by the poses and the images
+    judge         the reading that the images show, or the question to the user
+
+A reading is taken if its residual is what sound drives have, and those of all others are clearly larger.
+"""

@@ -1,0 +1,268 @@
+"""The reading of a rig and of poses that the images show, or the question to the user."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bevcli.errors import InputError
+from bevcli.geometry.transforms import Array, inverse, rigid
+from bevcli.options import named
+from bevcli.sequences.files.calibration_file import RigDraft
+from bevcli.sequences.files.ego_motion_file import ReadPoses
+from bevcli.sequences.files.readings import PoseReading, Reading, RigReading, differing, question
+from bevcli.sequences.images import ListedDrive
+from bevcli.sequences.options import RigOptions
+from bevcli.workshop.formats.calibrations import poses_in_words
+from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
+from bevcli.workshop.formats.poses import of_reading
+from bevcli.workshop.odometry.stated import Poses
+from bevcli.workshop.readings.heights import height_above_road
+from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
+from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
+
+SOUND_PX = 2.5  # largest residual of a reading that is believed, reduced pixels
+CLEAR, CLEAR_PX = 2.0, 0.5  # factor and addition, by which the residuals of all others are larger
+SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
+CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
+SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
+LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
+FEWEST_PAIRS = 2  # of images, that decide
+CHORD_NS, CHORDS = 500_000_000, 60  # of short steps, by which readings are compared
+MOST_SLOW = 0.9  # share of the steps that must not be too fast
+BOTH = ("rig_axes", "pose_axes")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A reading of the rig and one of the poses, together.
+
+    Attributes:
+        rig: None where the rig is certain.
+        poses: None where they are certain, or there are none.
+        cameras: (P, 4, 4) ego_from_camera of each pair of images.
+        steps: (P, 4, 4) ego_b_from_ego_a.
+        way: (S, 4, 4) ego_b_from_ego_a of short steps all over the drive.
+        residual_px: of the matched points; infinite where nothing was compared.
+    """
+
+    rig: RigReading | None
+    poses: PoseReading | None
+    cameras: Array
+    steps: Array
+    way: Array
+    residual_px: float = np.inf
+
+    @property
+    def whole(self) -> Reading:
+        """Both readings as one."""
+        return Reading({**(self.rig.states if self.rig else {}), **(self.poses.states if self.poses else {})})
+
+    def is_like(self, other: "Candidate") -> bool:
+        """True where both mean the same."""
+        rigs = [[] if each.rig is None else list(each.rig.ego_from_camera.values()) for each in (self, other)]
+        return _alike(*(np.array(rig).reshape(-1, 4, 4) for rig in rigs)) and _alike(self.way, other.way)
+
+    @property
+    def is_forward(self) -> bool:
+        """False for a vehicle that drives backwards."""
+        return not len(self.way) or float(self.way[:, 0, 3].sum()) <= 0
+
+
+def _alike(a: Array, b: Array) -> bool:
+    if not len(a):
+        return True
+    turns = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).magnitude()
+    apart, length = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1), np.linalg.norm(a[:, :3, 3], axis=1)
+    return bool((turns < SAME_RAD).all() and (apart < SAME_M + SAME * length).all())
+
+
+def decide(draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOptions) -> tuple[RigDraft, ReadPoses]:
+    """The rig and the poses of a drive as the images show them, each with a note that says what decided.
+
+    Args:
+        draft: the rig, with its readings.
+        poses: with their readings.
+        drive: its frames, with any of the rigs and poses.
+        options: what the user states.
+
+    Raises InputError where the images do not decide: it names the options that do.
+    """
+    judged = _Judged(draft, poses, drive, options)
+    chosen, evidence = judged.chosen()
+    if chosen.rig is not None:
+        reading, raised = chosen.rig, ""
+        if options.height is None:
+            up, raised = judged.raised_by(chosen)
+            poses_of = {name: rigid((0, 0, up)) @ pose for name, pose in reading.ego_from_camera.items()}
+            reading = replace(reading, ego_from_camera=poses_of)
+        draft = _with_rig(draft, reading, evidence, raised)
+    if chosen.poses is not None:
+        assert poses.motion is not None
+        read = of_reading(chosen.poses, poses.motion.timestamps_ns, draft.rig)
+        notes = tuple(f"{note} ({evidence})" if evidence and chosen.rig is None else note for note in read.notes)
+        poses = replace(poses, motion=read.motion, notes=notes, readings=())
+    return draft, poses
+
+
+def _with_rig(draft: RigDraft, reading: RigReading, evidence: str, raised: str) -> RigDraft:
+    """The draft with the cameras where a reading has them."""
+    cameras = tuple(replace(each, ego_from_camera=reading.ego_from_camera[each.name]) for each in draft.rig.cameras)
+    first, *others = draft.findings
+    how = poses_in_words(reading) + (f" ({evidence})" if evidence else "") + raised
+    text = first.message.replace(poses_in_words(draft.readings[0]), how)
+    rig = replace(draft.rig, cameras=cameras)
+    return replace(draft, rig=rig, findings=(replace(first, message=text), *others), readings=())
+
+
+class _Judged:
+    """The candidates of a drive, compared with its images."""
+
+    def __init__(self, draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOptions) -> None:
+        self._draft, self._poses, self._drive, self._options = draft, poses, drive, options
+        self._times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
+        self._pairs = list(camera_pairs(drive, self._frames())) if options.image_check else []
+        self._points = MatchedPoints(self._pairs) if self._pairs else None
+
+    def _frames(self) -> list[tuple[int, int]]:
+        """The pairs of frames that are compared."""
+        tracks = list(self._tracks().values())
+        if not tracks:
+            return timed_pairs(self._times)
+        at = [track.at(self._times)[0] for track in tracks]
+        ways = [np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1) for each in at]
+        turns = inverse(at[0][:-1]) @ at[0][1:]
+        turned = Rotation.from_matrix(turns[:, :3, :3]).magnitude()
+        return moving_pairs(
+            self._times, *(np.concatenate([[0], np.cumsum(each)]) for each in (np.min(ways, axis=0), turned))
+        )
+
+    def _tracks(self) -> dict[int, Poses]:
+        """The poses by the index of their reading."""
+        motion = self._poses.motion
+        if motion is None:
+            return {}
+        if not self._poses.readings:
+            return {0: Poses.of(motion)}
+        return {
+            index: Poses(
+                motion.timestamps_ns,
+                Rotation.from_quat(np.roll(each.quaternions, -1, axis=1)).as_matrix(),
+                each.translations,
+            )
+            for index, each in enumerate(self._poses.readings)
+        }
+
+    def candidates(self) -> Iterator[Candidate]:
+        """All possible pairs of readings, those of the usual rig first."""
+        rigs: list[RigReading | None] = list(self._draft.readings) or [None]
+        readings: list[PoseReading | None] = list(self._poses.readings) or [None]
+        at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64).reshape(-1, 2)
+        short, nothing = self._short_steps(), np.zeros((0, 4, 4))
+        motions = {
+            index: (body_motions(track.at(at)[0]), body_motions(track.at(short)[0]))
+            for index, track in self._tracks().items()
+        }
+        for rig, (index, reading) in product(rigs, enumerate(readings)):
+            stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
+            where = stated if rig is None else rig.ego_from_camera
+            cameras = np.array([where[pair.camera.name] for pair in self._pairs]).reshape(-1, 4, 4)
+            body = where[reading.camera] if reading is not None and reading.camera else np.eye(4)
+            steps, way = (body @ each @ inverse(body) for each in motions.get(index, (nothing, nothing)))
+            if not _is_possible(way, short):
+                continue
+            if self._points is not None and not motions:
+                steps = self._points.motions_seen(cameras)
+            residual = np.inf if self._points is None else self._points.residual_px(cameras, steps)
+            yield Candidate(rig, reading, cameras, steps, way, residual)
+
+    def _short_steps(self) -> NDArray[np.int64]:
+        """(S, 2) times of short steps all over the drive; none without poses."""
+        motion = self._poses.motion
+        if motion is None:
+            return np.zeros((0, 2), dtype=np.int64)
+        first, last = max(motion.first_ns, int(self._times[0])), min(motion.last_ns, int(self._times[-1]))
+        starts = np.linspace(first, max(first, last - CHORD_NS), CHORDS).astype(np.int64)
+        return np.stack([starts, np.minimum(starts + CHORD_NS, max(first, last))], axis=1)
+
+    def chosen(self) -> tuple[Candidate, str]:
+        """The candidate that the images show, and the evidence in words. Raises InputError."""
+        found = sorted(self.candidates(), key=lambda each: each.residual_px)
+        if not found:
+            options = ", ".join(named(RigOptions, name) for name in ("rig_axes", "pose_axes", "poses_of"))
+            raise InputError(
+                f"{self._files(BOTH)}: in no reading the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
+                f"correct the poses, or state what they are by {options} or {named(RigOptions, 'pose_transform')}"
+            )
+        best = found[0]
+        left = [each for each in found if each.residual_px <= CLEAR * best.residual_px + CLEAR_PX]
+        if best.residual_px > SOUND_PX or len(self._pairs) < FEWEST_PAIRS:
+            left = [each for each in found if each.is_forward] or found
+        left = [each for index, each in enumerate(left) if not any(each.is_like(other) for other in left[:index])]
+        if len(left) > 1:
+            raise self._question(left)
+        others = [each for each in found if not each.is_like(left[0])]
+        if not others or not np.isfinite(best.residual_px):
+            return left[0], ""
+        names = differing([left[0].whole, others[0].whole])
+        other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
+        return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
+
+    def _question(self, left: Sequence[Candidate]) -> InputError:
+        """The error that names the readings left, and the options that decide."""
+        wholes = [each.whole for each in left]
+        why = "the images do not tell which it is"
+        if not self._options.image_check:
+            why = "the images are not compared"
+        elif not self._pairs:
+            why += " (the vehicle does not move, or they show too little)"
+        else:
+            why += f" (residuals {left[0].residual_px:.1f} px, {left[1].residual_px:.1f} px)"
+        return question(self._files(differing(wholes)), why, wholes)
+
+    def _files(self, names: Sequence[str]) -> str:
+        """The files that options state."""
+        are_of_poses = {name.startswith("pose") for name in names}
+        parts = ((self._draft, False), (self._poses, True))
+        return " and ".join(str(part.file) for part, of_poses in parts if part.readings and of_poses in are_of_poses)
+
+    def raised_by(self, chosen: Candidate) -> tuple[float, str]:
+        """By how much the cameras are higher above the road than the file states, metres; and why, in words.
+
+        Raises InputError where they may be higher, and the images do not tell.
+        """
+        assert chosen.rig is not None
+        heights = [float(pose[2, 3]) for pose in chosen.rig.ego_from_camera.values()]
+        points, seen = self._points, None
+        if points is not None and self._poses.motion is not None:
+            seen = height_above_road(points, chosen.cameras, chosen.steps)
+        if seen is None or seen.clearness < CLEAR_HEIGHT:
+            if max(heights) > LOWEST_OF_GROUND_M and min(heights) > 0:
+                return 0.0, ""
+            raise InputError(
+                f"{self._draft.file}: the cameras are {min(heights):.2f} to {max(heights):.2f} m above the origin, and "
+                "the images do not tell its height: pass `--height 1.5` (`height`), the mean height of the cameras "
+                f"above the road, or `--height {max(np.mean(heights), 0.1):.2f}` where the origin is on the road"
+            )
+        stated = float(np.mean(chosen.cameras[:, 2, 3]))
+        if abs(seen.height_m - stated) <= max(SAME_HEIGHT_M, SAME_HEIGHT * stated):
+            return 0.0, ""
+        up = seen.height_m - stated
+        return (
+            up,
+            f"; raised by {up:.2f} m, as the images show the cameras {np.mean(heights) + up:.2f} m above the road",
+        )
+
+
+def _is_possible(way: Array, times_ns: NDArray[np.int64]) -> bool:
+    """False for a vehicle that moves aside, or faster than vehicles do."""
+    seconds, lengths = (times_ns[:, 1] - times_ns[:, 0]) / 1e9, np.linalg.norm(way[:, :3, 3], axis=1)
+    moving = lengths > MOVING_M_S * seconds
+    if not moving.any():
+        return True
+    moved = way[moving, :3, 3]
+    aside = np.arctan2(np.linalg.norm(moved[:, 1:], axis=1), np.abs(moved[:, 0]))
+    return bool((lengths <= FASTEST_M_S * seconds)[moving].mean() > MOST_SLOW and np.median(aside) < ASIDE)
