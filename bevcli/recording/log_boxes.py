@@ -12,7 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from bevcli.frame import FrameStamp
+from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.boxes2d import Boxes2D
@@ -112,6 +112,21 @@ def box_colors(boxes: Boxes3D | Boxes2D, classes: Mapping[str, Color]) -> np.nda
     other = entities.index_color(len(classes))
     names = [OF_COCO.get(name, name) for name in boxes.classes.tolist()]
     return np.array([classes.get(name, other) for name in names], dtype=np.uint8).reshape(-1, 3)
+
+
+def image_box_colors(
+    prediction: Prediction, frame: Frame, seen: Mapping[str, Boxes2D], least: float, classes: Mapping[str, Color]
+) -> dict[str, np.ndarray]:
+    """Camera -> (N, 3) colours of boxes in its image: bright where no box of the model explains one, else half as much.
+
+    least: score of the model's boxes.
+    """
+    from bevcli.workshop.trust.sightings import unexplained
+
+    boxes = prediction.boxes_ego.scored(least).transformed(frame.world_from_ego.matrix)
+    lonely = unexplained(frame, boxes, seen, prediction.object_classes)
+    shades = {name: np.where(each, 1.0, 0.5)[:, None] for name, each in lonely.items()}
+    return {name: (box_colors(each, classes) * shades[name]).astype(np.uint8) for name, each in seen.items()}
 
 
 def log_boxes_3d(

@@ -271,7 +271,8 @@ class Recording:
             if self._recorded.config is not None and self._recorded.config.image_classes:
                 found_in = prediction.image_boxes or {}
                 shown = {name: boxes.scored(self._options.score) for name, boxes in found_in.items()}
-                colors = {name: log_boxes.box_colors(boxes, self._recorded.classes) for name, boxes in shown.items()}
+                least, classes = self._options.score, self._recorded.classes
+                colors = log_boxes.image_box_colors(prediction, frame, shown, least, classes)
                 log_cameras.log_image_boxes(stream, cameras, shown, colors)
             self._log_stages(prediction, is_first=is_first)
         elif self._recorded.map_classes:

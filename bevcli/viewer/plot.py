@@ -12,7 +12,7 @@ from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import inverse
 from bevcli.recording import entities
 from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_colors
-from bevcli.recording.log_boxes import MOVING_M_S, box_colors
+from bevcli.recording.log_boxes import MOVING_M_S, box_colors, image_box_colors
 from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
 from bevcli.recording.log_static import bev_image_points, range_lines
 from bevcli.recording.meshes import default_vehicle
@@ -93,7 +93,8 @@ def _camera_image(
     own_colors, texts = box_colors(boxes, colors), box_labels(boxes)
     if prediction.image_boxes and camera.name in prediction.image_boxes:
         in_image = prediction.image_boxes[camera.name].scored(score)
-        for outline, color in zip(in_image.outlines(), box_colors(in_image, colors), strict=True):
+        shades = image_box_colors(prediction, frame, {camera.name: in_image}, score, colors)[camera.name]
+        for outline, color in zip(in_image.outlines(), shades, strict=True):
             draw_lines(canvas, [outline * (width / camera.width, height / camera.height)], _bgr(color))
     for box in np.unique(lines.owners):
         draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)

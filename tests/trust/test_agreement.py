@@ -22,7 +22,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_table import ImageBoxesWriter
 from bevcli.workshop.trust import estimate
 from bevcli.workshop.trust.agreement import Agreement, agreement, compared, kept
-from bevcli.workshop.trust.sightings import projected
+from bevcli.workshop.trust.sightings import projected, unexplained
 from bevcli.workshop.trust.witness import load_witness, seen_in_run
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
@@ -149,6 +149,16 @@ def test_what_tells_nothing_is_no_object(witness: dict[str, Boxes2D], objects: i
 def test_a_turned_camera_shows_as_a_shift():
     shift = held(CARS, seen(CARS, right_px=6.0)).shifts["front"]
     assert (shift.right_px, shift.down_px, shift.scale) == pytest.approx((6, 0, 1))
+
+
+def test_what_no_box_explains_is_named():
+    witness = joined(*seen(CARS).values(), of_image("traffic light", 300, 100, 320, 150))
+    assert unexplained(frame(), CARS[1:4], witness, NUSCENES_CLASSES)["front"].tolist() == [
+        True,
+        *[False] * 3,
+        True,
+        False,
+    ]
 
 
 def test_groups_do_not_explain_each_other():

@@ -17,13 +17,13 @@ from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import CameraPoints, camera_findings, share
 from bevcli.workshop.trust.faults import (
+    ReversedColors,
     find_faults,
     image_findings,
     input_faults,
     model_faults,
     one_cause,
     repeated,
-    reversed_colors,
 )
 
 RIG: CameraRig = nuscenes_like_rig(512, 288)
@@ -161,11 +161,22 @@ def test_boxes_agree_that_have_one_class_and_place():
     assert repeated([wanted], [given]) == (3, 1 / 3)
 
 
+class OneFrame(planted_faults.DerivedDrive):
+    """A drive of one frame with one image."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels, self.name, self.rig, self.stamps, self.has_ego_motion = pixels, "one", RIG, (), False
+
+    def load(self, index: int) -> planted_faults.Frame:
+        image = planted_faults.CameraImage(0, self.pixels)
+        return planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None)
+
+
 def test_colors_that_are_reversed_twice_are_the_same():
-    image = planted_faults.CameraImage(0, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
-    once = reversed_colors(planted_faults.Frame(None, RIG, {"CAM_FRONT": image}, None, {}, None))
-    assert once.images["CAM_FRONT"].pixels_bgr[0, 0].tolist() == [2, 1, 0]
-    assert np.array_equal(reversed_colors(once).images["CAM_FRONT"].pixels_bgr, image.pixels_bgr)
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    once = ReversedColors(OneFrame(pixels))
+    assert once.load(0).images["CAM_FRONT"].pixels_bgr[0, 0].tolist() == [2, 1, 0]
+    assert np.array_equal(ReversedColors(once).load(0).images["CAM_FRONT"].pixels_bgr, pixels)
 
 
 @pytest.fixture(scope="module")

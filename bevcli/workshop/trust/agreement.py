@@ -19,9 +19,8 @@ from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import aligned, number
 from bevcli.workshop.scores.evaluate import finite
-from bevcli.workshop.trust.sightings import GROUPS, NOTHING, Sightings, sightings
+from bevcli.workshop.trust.sightings import GROUPS, NOTHING, PARTNER, Sightings, sightings
 
-PARTNER = 0.3  # overlap from which on two boxes explain each other
 NEAR_M, MARGIN_M = 2.0, 4.0  # a box is kept within this distance of where it is expected; it may leave the range
 RESAMPLES, ENDS = 1000, (5, 95)  # of the seconds; percentiles of the interval
 FEWEST_SECONDS, FEWEST_OBJECTS = 3, 20  # for an interval; for a score without a note

@@ -17,6 +17,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 GROUPS = ("vehicles", "people", "cycles")
 _OF_COCO = {"car": 0, "truck": 0, "bus": 0, "person": 1, "bicycle": 2, "motorcycle": 2}
 _OF_KIND = {"vehicle": 0, "pedestrian": 1, "cycle": 2}  # of the attributes of a class of objects
+PARTNER = 0.3  # overlap from which on two boxes explain each other
 SURE, POSSIBLE = 0.4, 0.2  # scores of the witness: of an object, and of one that may confirm a box
 LEAST_PX = 16.0  # height of an object in an image
 EDGE_PX = 2.0  # a seen box that ends this near the edge of the image may go on outside
@@ -97,6 +98,23 @@ def intersections(a: Array, b: Array) -> Array:
 def areas(corners: Array) -> Array:
     """(N,) areas of rectangles."""
     return np.asarray(np.maximum(corners[:, 2:] - corners[:, :2], 0).prod(axis=1))
+
+
+def unexplained(
+    frame: Frame, boxes: Boxes3D, seen: Mapping[str, Boxes2D], classes: Mapping[str, ObjectClass]
+) -> dict[str, NDArray[np.bool_]]:
+    """Camera -> (N,) of the boxes in its image, whether the witness is sure of it, and no projected box explains it.
+
+    Arguments are those of `sightings`.
+    """
+    groups, lonely = np.array([group_of(name, classes) for name in boxes.classes.tolist()], dtype=int), {}
+    for name, in_image in seen.items():
+        pose = frame.world_from_ego_at[name].matrix @ frame.rig[name].ego_from_camera
+        kinds = np.array([_OF_COCO.get(kind, -1) for kind in in_image.classes.tolist()], dtype=int)
+        overlap = overlaps(projected(boxes, inverse(pose), frame.rig[name]), in_image.corners)
+        best = (overlap * (groups[:, None] == kinds)).max(axis=0, initial=0)
+        lonely[name] = (kinds >= 0) & (in_image.scores >= SURE) & (best < PARTNER)
+    return lonely
 
 
 def sightings(
