@@ -255,3 +255,34 @@ def test_four_coefficients_without_a_lens_are_noted_and_the_other_is_stated(tmp_
         assert found.rig[NAMES[0]].distortion.model == "kannala_brandt"
         assert found.rig[NAMES[0]].distortion.coefficients == (0.02, 0.004, -0.003, 0.001)
         assert len(found.notes) == 1
+
+
+@pytest.mark.parametrize("lens", ["PinHole", "KannalaBrandt8"])
+def test_two_cameras_of_orb_slam(tmp_path, lens):
+    """The first camera is placed on the IMU, and the second from the first."""
+    left, right = NAMES[0], NAMES[1]
+    names = ("k1", "k2", "p1", "p2") if lens == "PinHole" else ("k1", "k2", "k3", "k4")
+    lines = ["%YAML:1.0", 'File.version: "1.0"', f'Camera.type: "{lens}"', f"Camera.width: {SIZE[0]}"]
+    lines.append(f"Camera.height: {SIZE[1]}")
+    for number, name in ((1, left), (2, right)):
+        values = dict(zip(("fx", "fy", "cx", "cy", *names), [*four(name), *D[:4]], strict=True))
+        lines += [f"Camera{number}.{key}: {value}" for key, value in values.items()]
+    for key, matrix in (("IMU.T_b_c1", pose(left)), ("Stereo.T_c1_c2", np.linalg.inv(pose(left)) @ pose(right))):
+        data = ", ".join(map(str, matrix.ravel()))
+        lines.append(f"{key}: !!opencv-matrix\n  rows: 4\n  cols: 4\n  dt: f\n  data: [{data}]")
+    found = read(written(tmp_path, "\n".join(lines), "stereo.yaml"), None).rig
+    for camera, name in (("Camera1", left), ("Camera2", right)):
+        np.testing.assert_allclose(found[camera].ego_from_camera, pose(name), atol=1e-6)
+        np.testing.assert_allclose(found[camera].intrinsics, k_of(name))
+        assert found[camera].distortion.model == ("brown_conrady" if lens == "PinHole" else "kannala_brandt")
+
+
+def test_the_folder_of_euroc(tmp_path):
+    for index, name in enumerate(sorted(NAMES)):
+        camera = {"sensor_type": "camera", "T_BS": {"cols": 4, "rows": 4, "data": pose(name).ravel().tolist()},
+                  "resolution": list(SIZE), "camera_model": "pinhole", "intrinsics": four(name),
+                  "distortion_model": "radial-tangential", "distortion_coefficients": D[:4]}  # fmt: skip
+        written(tmp_path, camera, f"mav0/cam{index}/sensor.yaml")
+    written(tmp_path, {"sensor_type": "imu", "rate_hz": 200}, "mav0/imu0/sensor.yaml")
+    found = read(tmp_path / "mav0", None)
+    assert_is_the_street(found.rig, [f"cam{index}" for index in range(len(NAMES))], lens=True)

@@ -51,6 +51,13 @@ def gpx(version="1.1"):
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<gpx {name}><trk><trkseg>{points}</trkseg></trk></gpx>'
 
 
+def kml():
+    whens = "".join(f"<when>{date}</when>" for date in DATES)
+    places = "".join(f"<gx:coord>{lon} {lat} 520</gx:coord>" for lat, lon in zip(LATITUDE, LONGITUDE, strict=True))
+    name = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"'
+    return f"<kml {name}><Document><Placemark><gx:Track>{whens}{places}</gx:Track></Placemark></Document></kml>"
+
+
 def gopro(fix=("3",) * COUNT, latitude=LATITUDE):
     head = ('"cts","date","GPS (Lat.) [deg]","GPS (Long.) [deg]","GPS (Alt.) [m]","GPS (2D speed) [m/s]",'
             '"GPS (3D speed) [m/s]","fix","precision","altitude system"')  # fmt: skip
@@ -84,12 +91,13 @@ FILES = {
     "gps without heading": (table("timestamp,lat,lon,alt", S, LATITUDE, LONGITUDE, ZERO), "GPS", True),
     "gpx": (gpx(), "GPS", True),
     "gpx 1.0": (gpx("1.0"), "GPS", True),
+    "kml": (kml(), "GPS", True),
     "gopro": (gopro(), "GPS", True),
     "nmea": (nmea(), "GPS", True),
     "radians": (table("time,latitude,longitude,heading", S, *RADIANS, COMPASS), "longitude in radians", False),
     "radians by name": (table("time,lat_rad,lon_rad,heading", S, *RADIANS, COMPASS), "in radians", False),
     "radians beside metres": (
-        table("time,easting,northing,latitude,longitude,heading", S, X + 5e5, Y + 5e6, *RADIANS, COMPASS),
+        table("GPSTime,easting,northing,latitude,longitude,heading", S, X + 5e5, Y + 5e6, *RADIANS, COMPASS),
         "latitude and longitude in radians", False),
     "Odometry": (message(X, Y, ZERO, *QUATERNIONS, after=78, frames=("odom", "base")), "seconds and nano", False),
     "PoseStamped": (message(X, Y, ZERO, *QUATERNIONS), "seconds and nanoseconds", False),

@@ -23,6 +23,7 @@ from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, 
 from bevcli.workshop.formats.autoware import urdf_document, with_own_names
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
+from bevcli.workshop.formats.orb_slam import with_cameras_apart
 from bevcli.workshop.formats.pose_readings import quaternions_of_angles
 from bevcli.workshop.formats.waymo import with_intrinsics_by_name
 
@@ -72,7 +73,13 @@ def read_named(path: Path) -> Cameras:
 
 def files_in(folder: Path) -> list[Path]:
     """The files of a folder that may be calibrations, by their suffix."""
-    return [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES] if folder.is_dir() else []
+    files = [*sorted(folder.iterdir()), *sorted(folder.glob("cam*/sensor.yaml"))] if folder.is_dir() else []  # EuRoC's
+    return [file for file in files if file.suffix.lower() in SUFFIXES]
+
+
+def _stem(path: Path) -> str:
+    """The camera of a file: its name, or that of its folder for EuRoC's cam0/sensor.yaml."""
+    return path.parent.name if path.name == "sensor.yaml" else path.stem
 
 
 def read_document(path: Path) -> Any:
@@ -114,7 +121,7 @@ def cameras_of(document: Any, path: Path) -> Cameras:
         document = {"cameras": document}
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
-    document = {re.sub(r"\ACamera\d*\.", "", str(key)): value for key, value in document.items()}  # ORB-SLAM's names
+    document = with_cameras_apart(document)
     entries = _value(document, "cameras", "sensors", "cameracalibrations")
     if isinstance(entries, list):
         names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")
@@ -123,7 +130,7 @@ def cameras_of(document: Any, path: Path) -> Cameras:
             raise InputError(f"{path}: camera {name} is in the list twice: keep one")
         entries = dict(zip(names, entries, strict=True))
     if not isinstance(entries, dict) and _is_camera(document):
-        entries = {str(_value(document, "cameraname", "name") or path.stem): document}
+        entries = {str(_value(document, "cameraname", "name") or _stem(path)): document}
     if not isinstance(entries, dict):
         entries = {name: entry for name, entry in document.items() if _is_camera(entry)}
     if not entries:

@@ -20,7 +20,8 @@ _LENGTH = "(?:_(?:m|mm|cm|km))?"
 _OF = "(?:.*[._])?"  # such as field.pose.pose. in front of position.x
 # By quantity, the names of its column in lower case.
 NAMES = {
-    "time": rf"t|secs?|seconds|{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch){_UNIT}",
+    "time": rf"t|secs?|seconds|(?:gps|unix|utc|date)[_ ]?time{_UNIT}|"
+            rf"{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch){_UNIT}",
     "seconds": rf"{_OF}secs?",
     "nanoseconds": rf"{_OF}(?:nsecs?|nanosecs?)",
     **{axis: rf"[pt]?_?{axis}{_LENGTH}|p_\w+_{axis}|{_OF}(?:pos|pose|position|translation|location)[._]?{axis}{_LENGTH}"

@@ -1,8 +1,9 @@
-"""Files of positions without named columns, as tables: GPX, NMEA, and what `ros2 topic echo --csv` prints."""
+"""Files of positions without named columns, as tables: GPX, KML, NMEA, and what `ros2 topic echo --csv` prints."""
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 from bevcli.errors import InputError
 from bevcli.parsing.documents import CSV_BYTES
@@ -25,13 +26,13 @@ GOPRO = {
     "fix": "fix",
 }  # fmt: skip
 NMEA = re.compile(r"\$(?:G[A-Z])(GGA|RMC),")
-XML = (b"<?xml", b"<gpx")
+XML = (b"<?xml", b"<gpx", b"<kml ")
 
 
 def table_text(path: Path) -> str:
     """The text of a table of poses; of a file of another kind, a table of what it states. Raises InputError."""
     if read_bytes(path, CSV_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() in XML:
-        return "\n".join(_of_gpx(path))
+        return "\n".join(_of_track(path))
     text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
     first = text.lstrip().partition("\n")[0].strip()
     if NMEA.match(first) or first.startswith("$G"):
@@ -45,17 +46,30 @@ def table_text(path: Path) -> str:
     return text
 
 
-def _of_gpx(path: Path) -> Iterator[str]:
+def _of_track(path: Path) -> Iterator[str]:
+    """The points of a track in GPX, or in KML (gx:Track)."""
     yield "time,latitude,longitude,altitude"
-    root = parse_xml(read_bytes(path, CSV_BYTES), path)
-    points = [element for element in root.iter() if re.sub(r"\{.*\}", "", str(element.tag)) == "trkpt"]
-    if not points:
-        raise InputError(f"{path}: has no points of a track (expected <trkpt> elements of GPX)")
+    elements: dict[str, list[Element]] = {}
+    for element in parse_xml(read_bytes(path, CSV_BYTES), path).iter():
+        elements.setdefault(_plain(element), []).append(element)
+    points, places, times = (elements.get(name, []) for name in ("trkpt", "coord", "when"))
+    if not points and not places:
+        raise InputError(f"{path}: has no points of a track (expected <trkpt> of GPX, or <gx:coord> of KML)")
+    if places and len(places) != len(times):
+        raise InputError(f"{path}: has {len(places)} places and {len(times)} times: export the track with times")
+    for place, when in zip(places, times, strict=True):
+        longitude, latitude, altitude = [*(place.text or "").split(), "", "", "0"][:3]
+        yield f"{(when.text or '').strip()},{latitude},{longitude},{altitude or 0}"
     for number, point in enumerate(points, 1):
-        values = {re.sub(r"\{.*\}", "", str(child.tag)): (child.text or "").strip() for child in point}
+        values = {_plain(child): (child.text or "").strip() for child in point}
         if not values.get("time"):
             raise InputError(f"{path}: point {number} has no time: export the track with times")
         yield f"{values['time']},{point.get('lat', '')},{point.get('lon', '')},{values.get('ele') or 0}"
+
+
+def _plain(element: Element) -> str:
+    """The name of an element, without its namespace."""
+    return re.sub(r"\{.*\}|.*:", "", str(element.tag))
 
 
 def _of_nmea(path: Path, text: str) -> Iterator[str]:
