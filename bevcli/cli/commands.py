@@ -75,6 +75,8 @@ def viz(
 
     if options.frame is not None and options.screenshot is None and (options.summary or options.video or options.out):
         raise typer.BadParameter("is only valid with --screenshot, or for the viewer", param_hint="--frame")
+    if options.view != "all" and options.video is None:
+        raise typer.BadParameter("is only valid with --video", param_hint="--view")
     if not viewing.is_recording(shown):
         viewing.record_drive(shown, options, recording, source, format_options)
         return

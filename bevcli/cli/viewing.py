@@ -74,9 +74,9 @@ def _write_views(recording: Path, read_from: Path, options: ViewOptions, name: P
         views = take_screenshot(read_from, options.screenshot, options.frame)
         say(f"{options.screenshot}: {len(views)} views")
     if options.video is not None:
-        count, rate = frame_rate(read_from)
+        count, rate = frame_rate(read_from, options.view)
         with Progress(count, "frames") as progress:
-            for _ in write_video(read_from, options.video, count, rate):
+            for _ in write_video(read_from, options.video, count, rate, options.view):
                 progress.advance()
         say(f"{options.video}: {counted(count, 'frames')}, {rate:.3g} per second")
 

@@ -22,6 +22,7 @@ WIDTH, HEIGHT = 1920, 640
 BEV_SIDE = 640
 CAMERAS_WIDTH = WIDTH - BEV_SIDE
 CAMERAS_HEIGHT = 500
+SMALL_TEXT, LABEL_SHARE = 0.36, 1 / 1800  # size of a label: the smallest one, and by the width of the image
 BEV_MARGIN = 1.02  # of the range rings and the border of the grid
 BACKGROUND = (25, 20, 18)
 TEXT, WARNING = (225, 220, 215), (85, 70, 255)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
+from typing import Literal
 
 from bevcli.options import option, options
+
+VideoView = Literal["all", "images"]
 
 
 def parse_host(text: str) -> str:
@@ -66,4 +69,8 @@ class ViewOptions:
         default=None,
         help="Write a video of all cameras and the BEV, with boxes: H.264 if PyAV is installed, else VP9.",
         metavar="OUT.mp4|.webm",
+    )
+    view: VideoView = option(
+        default="all",
+        help="What --video shows. images: the images with the boxes and nothing else, at their own size and rate.",
     )

@@ -21,6 +21,8 @@ from bevcli.viewer.drawing import (
     BEV_MARGIN,
     CAMERAS_HEIGHT,
     CAMERAS_WIDTH,
+    LABEL_SHARE,
+    SMALL_TEXT,
     TEXT,
     UNTRAINED,
     WARNING,
@@ -36,7 +38,6 @@ from bevcli.viewer.drawing import (
 )  # fmt: skip
 
 TOP = (4, 5, 6, 7, 4)  # corners of a box, around its top
-LABEL_SHARE = 1 / 1800  # size of a label by the width of the image
 
 
 def plot(prediction: Prediction, image: str | None, score: float, color_order: ColorOrder) -> Canvas:
@@ -98,7 +99,7 @@ def _camera_image(
             draw_lines(canvas, [outline * (width / camera.width, height / camera.height)], _bgr(color))
     for box in np.unique(lines.owners):
         draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)
-    size = max(0.36, width * LABEL_SHARE)
+    size = max(SMALL_TEXT, width * LABEL_SHARE)
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
         draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own_colors[box]), size, centered=True)
     draw_title(canvas, camera.name, has_image=True)

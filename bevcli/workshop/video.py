@@ -1,4 +1,4 @@
-"""Writes a video of a recording: all cameras with their boxes, the BEV to the right, a legend below.
+"""Writes a video of a recording: all cameras with their boxes, the BEV to the right, a legend below; or images alone.
 
 H.264 in MP4, which plays everywhere, if PyAV is installed; VP9 else and in WebM.
 """
@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,19 +25,21 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import plain_name
 from bevcli.parsing.images import decode_image
 from bevcli.recording import entities
+from bevcli.recording.blueprint import rows_by_yaw
 from bevcli.recording.entities import Color, class_colors, map_colors
 from bevcli.recording.options import has_av, require_av
 from bevcli.viewer.drawing import (
+    BACKGROUND,
     BEV_MARGIN,
     BEV_SIDE,
     CAMERAS_HEIGHT,
     CAMERAS_WIDTH,
     FAR,
-    HEIGHT,
+    LABEL_SHARE,
+    SMALL_TEXT,
     TEXT,
     UNTRAINED,
     WARNING,
-    WIDTH,
     Canvas,
     Tile,
     ToCanvas,
@@ -48,6 +52,7 @@ from bevcli.viewer.drawing import (
     new_sheet,
     tiles_of,
 )  # fmt: skip
+from bevcli.viewer.options import VideoView
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
@@ -173,7 +178,7 @@ def _camera_yaws(frame: RecordedFrame) -> dict[str, float]:
 
 
 def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedImages) -> Canvas:
-    """The video frame, (HEIGHT, WIDTH, 3) uint8 BGR.
+    """The video frame with all cameras and the BEV, the sheet of `new_sheet`, uint8 BGR.
 
     layout: where each camera's image goes. images: decodes them; frames must come in order.
     """
@@ -183,6 +188,39 @@ def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedI
         _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile, image)
     _draw_bev(canvas[:, CAMERAS_WIDTH:], frame)
     _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], frame)
+    return canvas
+
+
+def image_tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
+    """The rectangles of all cameras at the size of their images, side by side; those that look back are below."""
+    sizes = {name: _camera_size(frame, name).astype(int) for name in frame.texts(entities.RUN, "camera_names")}
+    tiles, top = list[Tile](), 0
+    for row in rows_by_yaw(_camera_yaws(frame)):
+        left = 0
+        for name in row:
+            tiles.append(Tile(name, left, top, *sizes[name].tolist()))
+            left += tiles[-1].width
+        top += max(tile.height for tile in tiles if tile.top == top)
+    return tuple(tiles)
+
+
+def draw_images(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedImages) -> Canvas:
+    """The images of a frame at their own size, with the boxes: (H, W, 3) uint8 BGR, H and W even, as videos need."""
+    width, height = (max(end) for end in zip(*((t.left + t.width, t.top + t.height) for t in layout), strict=True))
+    canvas = np.full((height + height % 2, width + width % 2, 3), BACKGROUND, dtype=np.uint8)
+    for tile in layout:
+        part = canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width]
+        image = images.image(frame, tile.camera)
+        if image is None:
+            draw_title(part, tile.camera, has_image=False)
+            continue
+        part[:] = image[: tile.height, : tile.width]
+        camera, size = entities.camera(tile.camera), max(SMALL_TEXT, tile.width * LABEL_SHARE)
+        boxes = [entities.overlay(tile.camera, "boxes"), *(entities.layer(camera, name) for name in _layers(frame))]
+        for entity in boxes:
+            draw_strips(part, frame, entity, np.asarray, 1 + tile.width // 800)
+        for entity in boxes:  # all of a label is in the image
+            draw_labels(part, frame, f"{entity}/labels", partial(np.maximum, 16 * size), size)
     return canvas
 
 
@@ -204,7 +242,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     for entity in (boxes, *layers):
         draw_strips(canvas, frame, entity, to_canvas)
     for entity in (boxes, *layers):
-        draw_labels(canvas, frame, f"{entity}/labels", to_canvas, 0.36)
+        draw_labels(canvas, frame, f"{entity}/labels", to_canvas, SMALL_TEXT)
     draw_title(canvas, tile.camera, has_image=image is not None)
 
 
@@ -291,8 +329,8 @@ def _rotation(frame: RecordedFrame, entity: str) -> Array:
     return columns[0].reshape(3, 3).T if len(columns) else np.eye(3)  # rerun stores matrices by columns
 
 
-def video(recording: str | Path, video: str | Path) -> tuple[int, float]:
-    """Write a video of a recording with all cameras and the map from above; return its frames, and those a second.
+def video(recording: str | Path, video: str | Path, view: VideoView = "all") -> tuple[int, float]:
+    """Write a video of a recording; return its frames, and those a second.
 
         bevcli.video("street.rrd", "street.mp4")
 
@@ -301,19 +339,21 @@ def video(recording: str | Path, video: str | Path) -> tuple[int, float]:
     Args:
         recording: a recording, or the folder of a run.
         video: the .mp4 or .webm file to write.
+        view: "all" for all cameras and the map from above, "images" for the images with the boxes and nothing else, at
+            their own size and rate.
 
     Raises:
         InputError: there is no such recording, it has no frames, or the video has another ending.
         OutputError: the video cannot be written.
     """
     with open_recording(Path(recording)) as file:
-        count, rate = frame_rate(file)
-        for _ in write_video(file, Path(video), count, rate):
+        count, rate = frame_rate(file, view)
+        for _ in write_video(file, Path(video), count, rate, view):
             pass
     return count, rate
 
 
-def write_video(recording: Path, video: Path, count: int, rate: float) -> Iterator[int]:
+def write_video(recording: Path, video: Path, count: int, rate: float, view: VideoView = "all") -> Iterator[int]:
     """Write the video, and yield after each frame. count, rate: of `frame_rate`. Raises as `video`."""
     if video.suffix.lower() not in FOURCC:
         raise InputError(f"{video}: the file must end in .mp4 or .webm")
@@ -321,8 +361,10 @@ def write_video(recording: Path, video: Path, count: int, rate: float) -> Iterat
         raise InputError(f"{recording}: the recording has no frames")
     encoder = _h264 if video.suffix.lower() == ".mp4" and has_av() else _vp9
     with whole_file(video) as whole, plain_name(whole) as unfinished:
-        with encoder(unfinished, rate) as write:
-            for index, image in enumerate(_images(recording)):
+        images = _images(recording, view)
+        first = next(images)
+        with encoder(unfinished, rate, (first.shape[1], first.shape[0])) as write:
+            for index, image in enumerate(chain([first], images)):
                 write(image)
                 yield index
         _check_complete(unfinished, count)
@@ -337,8 +379,8 @@ def _check_complete(video: str, count: int) -> None:
 
 
 @contextmanager
-def _vp9(video: str, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
-    writer = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*FOURCC[Path(video).suffix.lower()]), rate, (WIDTH, HEIGHT))
+def _vp9(video: str, rate: float, size: tuple[int, int]) -> Iterator[Callable[[np.ndarray], object]]:
+    writer = cv2.VideoWriter(video, cv2.VideoWriter.fourcc(*FOURCC[Path(video).suffix.lower()]), rate, size)
     if not writer.isOpened():
         raise OSError("OpenCV cannot open it: is its folder there and writable, and is there enough memory?")
     try:
@@ -348,19 +390,19 @@ def _vp9(video: str, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
 
 
 @contextmanager
-def _h264(video: str, rate: float) -> Iterator[Callable[[np.ndarray], object]]:
+def _h264(video: str, rate: float, size: tuple[int, int]) -> Iterator[Callable[[np.ndarray], object]]:
     import av
 
     with av.open(video, "w", options={"movflags": "+faststart"}) as container:
-        exact = Fraction(rate).limit_denominator(1000)
+        exact = Fraction(rate).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=exact, options={"crf": str(H264_QUALITY)})
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         yield lambda image: container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
         container.mux(stream.encode(None))
 
 
-def frame_rate(recording: Path) -> tuple[int, float]:
-    """The number of frames, and the frames per second: 1 / the median time between frames, limited to 1 to 30.
+def frame_rate(recording: Path, view: VideoView = "all") -> tuple[int, float]:
+    """The number of frames, and the frames per second: 1 / the median time between frames, of "all" limited to 1 to 30.
 
     Images are not decoded.
     """
@@ -368,12 +410,12 @@ def frame_rate(recording: Path) -> tuple[int, float]:
     times = np.array([frame.integers(entities.EGO, "timestamp_ns", 1)[0] for frame in frames], dtype=np.int64)
     steps = np.diff(times)
     seconds = float(np.median(steps[steps > 0])) / 1e9 if (steps > 0).any() else 1.0
-    return len(times), float(np.clip(1 / seconds, SLOWEST, FASTEST))
+    return len(times), 1 / seconds if view == "images" else float(np.clip(1 / seconds, SLOWEST, FASTEST))
 
 
-def _images(recording: Path) -> Iterator[np.ndarray]:
+def _images(recording: Path, view: VideoView) -> Iterator[np.ndarray]:
     layout: tuple[Tile, ...] = ()
-    images = RecordedImages()
+    images, (arrange, draw) = RecordedImages(), (image_tiles, draw_images) if view == "images" else (tiles, draw_frame)
     for frame in RecordingReader(recording).frames():
-        layout = layout or tiles(frame)
-        yield draw_frame(frame, layout, images)
+        layout = layout or arrange(frame)
+        yield draw(frame, layout, images)

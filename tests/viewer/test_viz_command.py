@@ -9,15 +9,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemoryDrive
+from memory_drive import MemoryDrive, make_camera
 from recorded_drive import bev_from_world, boxes_ahead, record
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
+from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
 from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.boxes_table import COLUMNS
+from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop import video
 from bevcli.workshop.video import write_video
 
@@ -147,3 +149,23 @@ def test_unknown_endings_are_refused(drive, tmp_path):
 def test_a_frame_of_a_summary_is_a_usage_error(drive):
     result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1", "--summary"])
     assert result.exit_code == 2
+
+
+def test_a_video_of_the_images_has_them_and_their_boxes_alone(tmp_path):
+    """Two cameras of other sizes look ahead; at 40 frames a second. A car stands 12 m ahead."""
+    cameras = (make_camera("LEFT", 20, 201, 120), make_camera("RIGHT", -20, 320, 180))
+    rig, path = CameraRig(cameras, default_ego_from_bev()), tmp_path / "r.rrd"
+    record(path, MemoryDrive(3, rig=rig, step_s=1 / 40))
+    viz(path, "--video", tmp_path / "v.mp4", "--view", "images")
+    written = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+    assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(40)
+    assert written.read()[1].shape == (180, 522, 3)  # 201 + 320, made even
+    frame = next(RecordingReader(path).frames())
+    images, layout = video.RecordedImages(), video.image_tiles(frame)
+    canvas = video.draw_images(frame, layout, images)
+    right = images.image(frame, "RIGHT")
+    drawn = (canvas[:, 201:521] != right).any(-1)
+    assert (canvas[:, 201:521][drawn] == (44, 158, 255)).all(-1).any()  # the car's orange, BGR
+    assert drawn.mean() < 0.1
+    assert not drawn[150:].any()
+    assert "only valid with --video" in CliRunner().invoke(app, ["viz", str(path), "--view", "images"]).output
