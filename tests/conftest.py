@@ -12,7 +12,7 @@ GROUPS = {
         *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
         *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     ),
-    "rendered": ("test_drive", "test_export", "test_random_rig"),
+    "rendered": ("test_drive", "test_export", "test_random_rig", "test_material", "test_body", "test_catalog"),
     "weights": ("test_checkpoints", "test_system_errors"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}

@@ -2,7 +2,6 @@
 
 import json
 import re
-import tomllib
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
@@ -53,10 +52,6 @@ def load(folder: Path, text: str) -> Car:
 MINIMAL = 'name = "a"\n{}\n[training.wheel]\nwidth = 1'
 
 
-def test_the_published_models_come_with_the_package() -> None:
-    assert {"tiny", "small", "base"} <= set(known_models())
-
-
 @pytest.mark.parametrize(
     ("name", "cells", "layers", "levels", "padded"),
     [("tiny", 50, 3, 1, (800, 480)), ("small", 150, 3, 1, (1280, 736)), ("base", 200, 6, 4, (1600, 928))],
@@ -69,13 +64,6 @@ def test_the_published_models_have_the_published_sizes(
     assert (config.encoder.layers, config.neck.levels, config.image.padded_size) == (layers, levels, padded)
     assert config.name == name
     assert config.ego_motion.history_shift == "both"
-
-
-def test_a_path_to_a_copy_gives_the_same_model(tmp_path: Path) -> None:
-    copy = tmp_path / "mine.toml"
-    source = Path(__file__).parents[1] / "bevcli" / "configs" / "tiny.toml"
-    copy.write_text(source.read_text())
-    assert load_config(copy) == load_config("tiny")
 
 
 def test_values_are_converted_to_the_types_of_the_dataclass(tmp_path: Path) -> None:
@@ -240,17 +228,6 @@ def test_own_entries_need_no_metadata_of_an_installation(group, installed):
     installed()
     assert list(registry.entries(group)) == sorted(OWN[group])
     assert all(registry.load(group, name) is not None for name in OWN[group])
-
-
-def test_bevcli_states_no_entry_points_of_its_own():
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-    assert "entry-points" not in project
-
-
-def test_a_new_format_of_bevcli_works_at_once(installed, monkeypatch):
-    installed()
-    monkeypatch.setitem(OWN[GROUP], "new", "json:loads")
-    assert registry.load(GROUP, "new")("[1]") == [1]
 
 
 def test_metadata_of_an_earlier_version_of_bevcli_are_ignored(installed):

@@ -23,10 +23,6 @@ NAMED_BLOCK = re.compile(r"^ *`([\w./]+)`:\n\n *```\w+\n(.*?)^ *```", flags=re.M
 FILES = {name: dedent(text) for name, text in NAMED_BLOCK.findall(PAGE)}
 
 
-def lines(name: str) -> int:
-    return len(FILES[name].splitlines())
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of the page with the metadata that pip writes, and a drive file."""
@@ -71,11 +67,6 @@ def install(folder: Path) -> None:
     sys.path.insert(0, str(folder))
     installed.cache_clear()
     entries.cache_clear()
-
-
-def test_format_and_model_of_the_page_are_short():
-    assert lines("bevcli_ground/drive_file.py") <= 48
-    assert lines("bevcli_ground/ground.py") <= 80
 
 
 def test_the_pages_commands_run(folder):

@@ -41,7 +41,6 @@ def test_the_commands_run(folder: Path) -> None:
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
-@pytest.mark.slow  # test_documents.py runs the same calls
 def test_how_far_official_weights_are_tested_is_said_once() -> None:
     """The first claim on them links to it."""
     text = (ROOT / "README.md").read_text()
@@ -50,6 +49,7 @@ def test_how_far_official_weights_are_tested_is_said_once() -> None:
     assert "(docs/weights.md#what-was-verified)" in claim
 
 
+@pytest.mark.slow  # test_documents.py runs the same calls
 def test_the_python_example_writes_a_recording(folder: Path) -> None:
     [example] = blocks("python")
     with contextlib.chdir(folder):

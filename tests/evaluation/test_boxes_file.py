@@ -67,15 +67,6 @@ def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
     assert len(found.frames[1].boxes) == 0
 
 
-def test_the_file_is_whole_after_every_frame(tmp_path: Path) -> None:
-    path = tmp_path / "predictions.json"
-    with BoxesWriter(path, "world") as writer:
-        for count in range(3):
-            assert len(read_boxes(path).frames) == count
-            writer.write(frame(count, some_boxes()))
-    assert len(read_boxes(path).frames) == 3
-
-
 def test_a_number_that_is_not_finite_is_refused_file_stays_whole(tmp_path: Path) -> None:
     path = tmp_path / "predictions.json"
     broken = some_boxes().transformed(np.full((4, 4), np.nan))

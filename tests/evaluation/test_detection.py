@@ -51,21 +51,9 @@ def test_average_precision_computed_by_hand() -> None:
     assert scores.overall.classes["car"].aps[2.0] == pytest.approx((8.2 + 24.25) / 90 / 0.9)
 
 
-def test_half_of_the_cars_found_without_a_false_positive() -> None:
-    # Precision 1 up to recall 0.5: of recalls 0.11 to 1.00, 40 of 90 count.
-    scores = evaluate_detections([cars([0, 10], [0.9, 0.8])], [cars([0, 10, 20, 30])])
-    assert scores.overall.classes["car"].aps[0.5] == pytest.approx(40 / 90)
-    assert scores.overall.classes["car"].recall == 0.5
-
-
 def test_a_match_is_closer_than_the_matching_distance() -> None:
     found = evaluate_detections([cars([1.5], [0.9])], [cars([0.0])]).overall.classes["car"].aps
     assert found == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
-
-
-def test_a_car_is_found_once() -> None:
-    twice = evaluate_detections([cars([0, 0.1], [0.9, 0.8])], [cars([0.0, 30.0])])
-    assert twice.overall.classes["car"].recall == 0.5
 
 
 def test_the_highest_score_is_matched_first() -> None:
@@ -154,21 +142,10 @@ def test_what_is_beyond_the_range_of_its_class_does_not_count() -> None:
     assert unlimited.overall.prediction_count == 2
 
 
-def test_the_ego_vehicle_is_where_ranges_start() -> None:
-    assert evaluate_detections([cars([60], [0.5])], [cars([60])], ego_xy=[[30.0, 0.0]]).overall.ground_truth_count == 1
-    assert evaluate_detections([cars([60], [0.5])], [cars([60])]).overall.ground_truth_count == 0
-
-
 def test_ground_truth_without_points_is_left_out() -> None:
     truth = replace(cars([0, 20, 30]), num_points=np.array([3, 0, -1]))
     scores = evaluate_detections([cars([0], [0.5])], [truth])
     assert scores.overall.ground_truth_count == 2
-
-
-def test_ground_truth_given_as_predictions_is_perfect() -> None:
-    truth = [replace(boxes, num_points=boxes.num_points % 3) for boxes in random_truth(10)]
-    scores = evaluate_detections([replace(boxes, scores=np.ones(len(boxes))) for boxes in truth], truth)
-    assert scores.overall.nd_score == pytest.approx(1)
 
 
 def test_an_error_without_ground_truth_is_left_out_of_nds() -> None:
@@ -232,46 +209,6 @@ def test_matching_equals_a_plain_loop(seed: int) -> None:
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "detection_metrics.json").read_text())
 TOLERANCE = 1e-9  # docs/scoring.md and README.md state it
-
-
-def boxes(rows: list[dict[str, Any]]) -> Boxes3D:
-    def column(key: str) -> Any:
-        return np.array([row[key] for row in rows])
-
-    return Boxes3D(
-        centers=column("center").reshape(-1, 3),
-        sizes_lwh=column("size_lwh").reshape(-1, 3),
-        yaws=column("yaw"),
-        velocities=column("velocity").reshape(-1, 2),
-        classes=column("class"),
-        scores=column("score"),
-        attributes=column("attribute"),
-    )
-
-
-def test_every_number_equals_the_devkits() -> None:
-    samples = list(dict.fromkeys(row["sample"] for row in GOLDEN["predictions"]))
-    predictions, ground_truth = (
-        [boxes([row for row in GOLDEN[key] if row["sample"] == sample]) for sample in samples]
-        for key in ("predictions", "ground_truth")
-    )
-    # The devkit's boxes had no ego poses, so it applied no class ranges (two predictions are outside).
-    scores = evaluate_detections(predictions, ground_truth, DetectionConfig().unlimited())
-    expected = GOLDEN["expected"]
-    for name, found in scores.overall.classes.items():
-        for distance, ap in found.aps.items():
-            assert ap == pytest.approx(expected["label_aps"][name][f"{distance:.1f}"], abs=TOLERANCE), (name, distance)
-        for error, value in found.errors.items():
-            number = expected["label_tp_errors"][name][error]
-            assert value == pytest.approx(np.nan if number is None else number, abs=TOLERANCE, nan_ok=True), (
-                name,
-                error,
-            )
-        assert found.mean_ap == pytest.approx(expected["mean_dist_aps"][name], abs=TOLERANCE)
-    assert scores.overall.mean_ap == pytest.approx(expected["mean_ap"], abs=TOLERANCE)
-    assert scores.overall.nd_score == pytest.approx(expected["nd_score"], abs=TOLERANCE)
-    assert scores.overall.errors == pytest.approx(expected["tp_errors"], abs=TOLERANCE)
-    assert scores.overall.error_scores == pytest.approx(expected["tp_scores"], abs=TOLERANCE)
 
 
 def test_every_number_of_evaluated_files_equals_the_devkits(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ it a stated number of times. A simulated device stops what a real one would stop
 
 import warnings
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.workshop.benchmark.made_up import made_up_model
 from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
-from bevcli.workshop.uniad.uniad import UniAD, UniADConfig
+from bevcli.workshop.uniad.uniad import UniADConfig
 
 CPU = torch.device("cpu")
 FRAMES = 3
@@ -378,14 +377,3 @@ def test_a_gpu_gets_the_next_frame_before_results_are_waited_for(name, monkeypat
         assert ours.stamp == theirs.stamp
         np.testing.assert_allclose(ours.boxes.centers, theirs.boxes.centers, atol=1e-3)
         np.testing.assert_array_equal(ours.boxes.instances, theirs.boxes.instances)
-
-
-def test_only_what_gains_by_it_is_overlapped(mini_model):
-    cuda = torch.device("cuda:0")
-    models = {True: mini_model, False: UniAD.__new__(UniAD)}
-    for overlaps, model in models.items():
-        runner = SimpleNamespace(model=model, device=cuda, options=StepOptions())
-        assert Runner.overlap.fget(runner) == overlaps
-        assert Runner.overlap.fget(SimpleNamespace(**{**vars(runner), "device": CPU})) == 0
-    observed = SimpleNamespace(model=mini_model, device=cuda, options=StepOptions(attention=True))
-    assert Runner.overlap.fget(observed) == 0

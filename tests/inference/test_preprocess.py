@@ -1,11 +1,6 @@
 """Images and projections of a frame for the network; resizing and normalising in one pass equals OpenCV's."""
 
-import gc
-import os
-import threading
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,8 +14,6 @@ from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.inference.preprocess import Preprocessor, image_for_rig, pixel_weights, resize_and_normalize
 from bevcli.model.step import assign_cameras, joined_inputs, model_inputs
-
-TASKS = Path("/proc/self/task")
 
 
 def textbook_image(pixels, image):
@@ -184,50 +177,6 @@ def test_frames_with_images_of_different_sizes_form_one_batch(mini_config):
     torch.testing.assert_close(batch.images[1, ..., :height, :width], prepared[1].images[0])
     assert (batch.images[1, ..., height:, :] == 0).all()
     assert (batch.images[1, ..., width:] == 0).all()
-
-
-@pytest.mark.skipif(not TASKS.exists(), reason="the kernel's threads are counted on Linux only")
-def test_frames_are_prepared_without_threads_of_openmp(mini_config, monkeypatch):
-    """More of them than processors would no longer spin while they wait: the model would take a fifth longer."""
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    preprocess = Preprocessor(replace(mini_config, image=replace(mini_config.image, size=(512, 288))))
-    frame, started, threads = MemoryDrive().load(1), [], torch.get_num_threads()
-    preprocess(frame)
-
-    def prepare():
-        before = len(list(TASKS.iterdir()))
-        preprocess(frame)
-        started.append(len(list(TASKS.iterdir())) - before)
-
-    torch.set_num_threads(2)
-    try:
-        reading = threading.Thread(target=prepare)
-        reading.start()
-        reading.join()
-    finally:
-        torch.set_num_threads(threads)
-    assert started == [0]
-
-
-def preprocessing_threads() -> set[int | None]:
-    return {thread.ident for thread in threading.enumerate() if thread.name.startswith("preprocess")}
-
-
-def test_one_pool_of_threads_prepares_all_frames(mini_config, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    before, sequence = preprocessing_threads(), MemoryDrive(8)
-    preprocess = Preprocessor(mini_config)
-    used = set()
-    for place in range(8):
-        preprocess(sequence.load(place))
-        used |= preprocessing_threads() - before
-    assert 1 <= len(used) <= 2
-    del preprocess
-    gc.collect()
-    ended_by = time.monotonic() + 10
-    while preprocessing_threads() & used and time.monotonic() < ended_by:
-        time.sleep(0.01)
-    assert not preprocessing_threads() & used
 
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}

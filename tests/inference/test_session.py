@@ -214,7 +214,3 @@ def test_objects_of_the_api_are_described_in_one_line(model, images):
         "MemoryDrive(memory, 1 frame, 6 cameras)": DRIVE,
     }
     assert {repr(each) for each in described.values()} == described.keys()
-
-
-def test_the_package_says_that_it_is_typed():
-    assert (Path(bevcli.__file__).parent / "py.typed").is_file()

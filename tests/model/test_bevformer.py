@@ -9,49 +9,12 @@ from small_model import small_inputs, small_model
 from bevcli.inference.attention import AttentionProbe
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.segmentation import SegmentationConfig
 from bevcli.model.step import ModelInputs, ModelOutputs
-
-
-def drive(model: BEVFormer, seeds: list[int], history: torch.Tensor | None = None) -> list[ModelOutputs]:
-    """The outputs of frames with these seeds; each frame's history is the BEV map of the one before."""
-    outputs = []
-    with torch.inference_mode():
-        for seed in seeds:
-            outputs.append(model(small_inputs(seed), history))
-            history = outputs[-1].bev
-    return outputs
 
 
 def assert_same(a: ModelOutputs, b: ModelOutputs) -> None:
     for name in ("bev", "class_logits", "box_codes"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name), atol=1e-5, rtol=1e-5)
-
-
-def test_outputs_have_the_stated_shapes() -> None:
-    outputs = small_model()(small_inputs(batch=2))
-    assert outputs.bev.shape == (2, 48, 32)
-    assert outputs.class_logits.shape == (2, 2, 12, 3)
-    assert outputs.box_codes.shape == (2, 2, 12, 10)
-
-
-def test_a_drive_cut_in_two_equals_the_whole() -> None:
-    model = small_model()
-    whole = drive(model, [0, 1, 2, 3])
-    start = drive(model, [0, 1])
-    for a, b in zip(whole, start + drive(model, [2, 3], start[-1].bev), strict=True):
-        assert_same(a, b)
-
-
-def test_a_new_scene_equals_a_fresh_start() -> None:
-    model = small_model()
-    drive(model, [0, 1])
-    assert_same(drive(model, [2])[0], drive(small_model(), [2])[0])
-
-
-def test_history_changes_the_answer() -> None:
-    with_history, without = drive(small_model(), [0, 1])[1], drive(small_model(), [1])[0]
-    assert (with_history.bev - without.bev).abs().mean() > 0.01
 
 
 @pytest.mark.parametrize("with_history", [False, True])
@@ -88,17 +51,6 @@ def test_a_camera_without_an_image_has_no_effect() -> None:
 def test_outputs_without_any_image_are_finite() -> None:
     inputs = replace(small_inputs(), has_image=torch.zeros(1, 2, dtype=torch.bool))
     assert small_model()(inputs).box_codes.isfinite().all()
-
-
-def test_every_parameter_receives_a_gradient() -> None:
-    segmentation = SegmentationConfig(5, attention_heads=4, feed_forward_width=48)
-    model = small_model(heads=("detection", "segmentation"), segmentation=segmentation).train()
-    outputs = model(small_inputs(), torch.randn(1, 48, 32))
-    assert outputs.segmentation is not None
-    maps = (outputs.segmentation.mask_logits, outputs.segmentation.class_logits, outputs.segmentation.locations)
-    torch.stack([x.square().mean() for x in (outputs.class_logits, outputs.box_codes, *maps)]).sum().backward()
-    without = [name for name, x in model.named_parameters() if x.grad is None or not x.grad.any()]
-    assert without == []
 
 
 def test_untrained_class_scores_are_a_hundredth() -> None:
@@ -161,29 +113,9 @@ def test_a_probe_finds_untrained_heads_samples_around_the_pillar() -> None:
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_without_history_a_probe_has_no_history_share() -> None:
-    model = small_model()
-    with AttentionProbe(model, layer=0, cells=torch.tensor([0])) as probe:
-        model(small_inputs())
-    assert probe.history_share is None
-
-
-def test_a_probe_leaves_no_hooks_behind_even_after_an_error() -> None:
-    model, wrong_inputs = small_model(), replace(small_inputs(), shift=torch.zeros(1, 3))
-    probe = AttentionProbe(model, layer=0, cells=torch.tensor([0]))
-    with pytest.raises(RuntimeError), probe:
-        model(wrong_inputs, torch.zeros(1, 48, 32))
-    assert hooks(model) == 0
-
-
 def hit(model: BEVFormer, inputs: ModelInputs) -> torch.Tensor:
     """(B, N, Y·X) bool: whether a camera sees a cell."""
     return model.pillars.project(inputs.image_from_bev, inputs.image_size, inputs.has_image).hit
-
-
-def hooks(model: BEVFormer) -> int:
-    """Number of hooks on the model's modules."""
-    return sum(len(module._forward_hooks) + len(module._forward_pre_hooks) for module in model.modules())
 
 
 def _row(inputs: ModelInputs, i: int) -> ModelInputs:

@@ -133,19 +133,3 @@ def test_an_observed_part_is_called_in_every_step(device):
         captured(inputs)
     captured(inputs)
     assert len(seen) == 2
-
-
-@pytest.mark.parametrize("function", [torch.Tensor.tolist, torch.nonzero, torch.where, torch.Tensor.cpu, torch.unique])
-def test_a_capture_stops_at_any_wait(device, function):
-    device.tape = []
-    with pytest.raises(RuntimeError, match="in a capture"):
-        function(on(device, 1.0, 0.0))
-    for fails in (
-        lambda: torch.ones(2).to(device.device),
-        lambda: torch.tensor([1.0], device=device.device),
-        lambda: on(device, 1.0) + torch.tensor(1.0),
-        lambda: on(device, 1.0)[on(device, 1.0) > 0],
-        lambda: torch.cuda.current_stream(device.device).synchronize(),
-    ):
-        with pytest.raises(RuntimeError):
-            fails()

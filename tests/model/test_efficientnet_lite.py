@@ -101,19 +101,6 @@ def test_a_prepared_model_gives_the_same_features(precision: str) -> None:
     torch.testing.assert_close(found.float(), expected, rtol=tolerance, atol=tolerance * expected.abs().max().item())
 
 
-def test_frozen_stages_keep_weights_and_statistics() -> None:
-    backbone, images = made_backbone(), torch.randn(2, 3, 64, 96)
-    before = {name: value.clone() for name, value in backbone.state_dict().items()}
-    backbone.freeze(3)
-    optimizer = torch.optim.AdamW(backbone.parameters(), lr=0.1, weight_decay=0.1)
-    backbone.train()
-    backbone(images)[-1].square().mean().backward()
-    optimizer.step()
-    changed = {name for name, value in backbone.state_dict().items() if not value.equal(before[name])}
-    assert changed
-    assert all(re.match(r"stages\.[34]\.", name) for name in changed)
-
-
 def test_the_kind_of_a_backbone_is_read_and_written() -> None:
     table = as_table(small_config(backbone=EfficientNetLiteConfig(variant=1)))
     assert table["backbone"]["kind"] == "efficientnet-lite"
@@ -136,14 +123,6 @@ def test_the_kind_of_a_backbone_is_read_and_written() -> None:
 def test_a_wrong_backbone_is_one_line(backbone: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         config_of_table(as_table(small_config()) | {"backbone": backbone}, "own.toml")
-
-
-def test_levels_have_the_sizes_of_the_maps() -> None:
-    config = small_config(backbone=EfficientNetLiteConfig())
-    model = BEVFormer(config).eval()
-    inputs = small_inputs(0)
-    with torch.no_grad():
-        assert model.image_features(inputs.images, inputs.camera_index).level_shapes == config.level_shapes
 
 
 @pytest.mark.parametrize("style", ["pytorch", "caffe"])

@@ -41,16 +41,6 @@ def small_head() -> MapHead:
     return head
 
 
-def test_shapes() -> None:
-    outputs = small_head()(torch.randn(2, 30, 16))
-    assert outputs.class_logits.shape == (2, 7, 3)
-    assert outputs.locations.shape == (2, 2, 7, 4)
-    assert outputs.queries.shape == outputs.labels.shape == outputs.scores.shape == (2, 9)
-    assert outputs.thing_masks.shape == (2, 9, 30)
-    assert outputs.stuff_masks.shape == (2, 1, 30)
-    assert outputs.thing_masks.min() >= 0
-
-
 def test_a_batch_of_two_equals_two_batches_of_one() -> None:
     head, bev = small_head(), torch.randn(2, 30, 16)
     together, alone = head(bev), head(bev[1:])

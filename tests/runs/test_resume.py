@@ -6,7 +6,6 @@ import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,15 +14,12 @@ from memory_drive import MemoryDrive
 from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
 from bevcli.inference.load import Model
-from bevcli.inference.runner import RunnerState
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.recording.options import RecordingOptions
-from bevcli.recording.writer import RecordingState
-from bevcli.runs import files
 from bevcli.runs.options import RunOptions
 from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
-from bevcli.runs.state import RunState, load_state, save_state
+from bevcli.runs.state import load_state, save_state
 from bevcli.runs.summary import Counts
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.viewer.recording_file import open_recording
@@ -233,31 +229,6 @@ def test_a_folder_that_is_deleted_during_the_run_is_an_error(model, tmp_path):
             list(running.frames)
         with pytest.raises(OutputError, match=r"deleted|cannot be written"):
             stack.close()
-
-
-def test_saving_states_takes_two_percent_of_the_time_at_most(model, tmp_path, monkeypatch):
-    clock, saved = [0.0], []
-    monkeypatch.setattr(files.time, "perf_counter", lambda: clock[0])
-
-    def slow_save(path, state):
-        clock[0] += 0.5
-        saved.append(clock[0])
-
-    with stepped(model, tmp_path / "out", MemoryDrive(1)) as running:
-        frame, prediction = next(running.frames)
-    monkeypatch.setattr(files, "save_state", slow_save)
-    written = SimpleNamespace(add=lambda *_, **__: None, is_complete=False, counts=Counts())
-    state = RunState({}, None, Counts())
-    run_files = files.RunFiles(
-        SimpleNamespace(path=tmp_path, state_path=None), MadeDrive(), model, None, written, state
-    )
-    run_files._recording = SimpleNamespace(state=lambda: RecordingState(""))
-    run_files._write = lambda frame, prediction: None
-    for _ in range(10_000):
-        clock[0] += 0.1
-        run_files.write((frame, prediction, RunnerState()))
-        assert len(saved) * 0.5 <= 0.02 * clock[0] + 0.5
-    assert len(saved) >= 30
 
 
 DAMAGE = {

@@ -18,11 +18,12 @@ from bevcli.workshop.synth.traffic import ActorState
 
 def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
     """Independent of the frames rendered before, and of the number of threads."""
-    again = RenderedDrive(113, frames=20, rig=drive.rig, assets=assets, weather="noon", threads=2)
+    two = CameraRig(drive.rig.cameras[:2], drive.rig.ego_from_bev)
+    again = RenderedDrive(113, frames=20, rig=two, assets=assets, weather="noon", threads=2)
     again.frame(2)
     other = again.frame(9)
-    for name, image in frame.images.items():
-        assert image.tobytes() == other.images[name].tobytes()
+    for name, image in other.images.items():
+        assert image.tobytes() == frame.images[name].tobytes()
     assert frame.boxes.centers.tobytes() == other.boxes.centers.tobytes()
     assert frame.bev_map.cells.tobytes() == other.bev_map.cells.tobytes()
 
@@ -117,7 +118,8 @@ def test_velocities_are_differences_of_positions(drive: RenderedDrive):
 def test_a_turn_moves_standing_boxes_in_ego_but_not_world_frame(drive: RenderedDrive, assets: Assets):
     turning = max(range(19), key=lambda k: _turned(drive, k))
     assert _turned(drive, turning) > np.radians(5)
-    first, second = drive.frame(turning), drive.frame(turning + 1)
+    front = with_rig(drive, CameraRig(drive.rig.cameras[:1], drive.rig.ego_from_bev))
+    first, second = front.frame(turning), front.frame(turning + 1)
     one = {i: k for k, i in enumerate(first.boxes.instances)}
     shared = [
         (one[i], k) for k, i in enumerate(second.boxes.instances)
@@ -197,6 +199,7 @@ def test_boxes_are_near_unique_and_have_valid_visibilities(drive: RenderedDrive,
     np.testing.assert_array_equal(boxes.num_points > 0, boxes.visibilities > 0)
 
 
+@pytest.mark.slow
 def test_supersampling_barely_changes_the_pixel_counts(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
     fine = RenderedDrive(113, frames=20, rig=drive.rig, assets=assets, weather="noon", supersampling=2).frame(9)
     large = frame.boxes.num_points > 200
@@ -206,7 +209,7 @@ def test_supersampling_barely_changes_the_pixel_counts(drive: RenderedDrive, fra
 
 def test_boxes_contain_their_pixels_with_lens_distortion(drive: RenderedDrive, frame: RenderedFrame):
     lens = Distortion("brown_conrady", (-0.25, 0.08, 0.001, -0.0005))
-    rig = CameraRig(tuple(replace(c, distortion=lens) for c in drive.rig.cameras), drive.rig.ego_from_bev)
+    rig = CameraRig((replace(drive.rig["CAM_BACK"], distortion=lens),), drive.rig.ego_from_bev)
     bent = with_rig(drive, rig)
     view, states = bent.frame(9).views["CAM_BACK"], [state for _, state in bent._actors(9)]
     camera, checked = rig["CAM_BACK"], 0
