@@ -1,4 +1,4 @@
-"""docs/own-images.md: its commands run on a folder as it describes, and its note is what they say."""
+"""docs/own-images.md and docs/cameras-only.md: their commands run on folders as they describe."""
 
 import csv
 import json
@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import command
+from command_line import MINI_TOML, command
 
 from bevcli.sequences.open import open_sequence
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/own-images.md").read_text()
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
-COMMANDS = [line for name, block in BLOCKS if name == "sh" for line in block.splitlines()]
+OWN_IMAGES = (ROOT / "docs/own-images.md").read_text()
+OWN_BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", OWN_IMAGES, flags=re.MULTILINE | re.DOTALL)
+OWN_COMMANDS = [line for name, block in OWN_BLOCKS if name == "sh" for line in block.splitlines()]
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def opened(drive):
 
 
 def test_the_note_of_the_page_is_what_is_said(my_drive):
-    shown = next(block for name, block in BLOCKS if "note: " in block)
+    shown = next(block for name, block in OWN_BLOCKS if "note: " in block)
     shown = " ".join(shown.split()).removeprefix("note: ").removesuffix(" …")
     said = next(note for note in opened(my_drive).notes if note.startswith("frames.csv"))
     within = re.compile(r"within \d+ ms")
@@ -68,7 +68,7 @@ def test_the_note_of_the_page_is_what_is_said(my_drive):
 
 
 def test_the_converted_drive_has_what_was_understood(my_drive, tmp_path):
-    done = command(tmp_path, *shlex.split(next(line for line in COMMANDS if "convert" in line))[1:])
+    done = command(tmp_path, *shlex.split(next(line for line in OWN_COMMANDS if "convert" in line))[1:])
     assert done.returncode == 0, done.stderr
     one, other = opened(my_drive), open_sequence(tmp_path / "my_sequence")
     assert (tmp_path / "my_sequence/frames.csv").exists()
@@ -84,11 +84,45 @@ def test_the_converted_drive_has_what_was_understood(my_drive, tmp_path):
 
 @pytest.mark.slow
 def test_the_commands_of_the_page_run(my_drive, tmp_path):
-    assert len(PAGE.splitlines()) < 50
-    for line in COMMANDS:
+    assert len(OWN_IMAGES.splitlines()) < 50
+    for line in OWN_COMMANDS:
         program, *arguments = shlex.split(line)
         assert program == "bevcli"
         if arguments[0] != "viz":  # which opens a viewer
             done = command(tmp_path, *arguments)
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     assert (tmp_path / "runs/my_drive-photographs/recording.rrd").exists()
+
+
+CAMERAS_ONLY = (ROOT / "docs/cameras-only.md").read_text()
+CAMERAS_COMMANDS = [shlex.split(line) for line in re.findall(r"^bevcli (.+)$", CAMERAS_ONLY, flags=re.MULTILINE)]
+
+
+@pytest.fixture
+def numbered_images(tmp_path):
+    """my_drive with two numbered images of each camera of the sample, and a small model."""
+    for camera in sorted((ROOT / "samples/street/images").iterdir()):
+        own = tmp_path / "my_drive" / camera.name.removeprefix("CAM_").lower()
+        own.mkdir(parents=True)
+        for index, image in enumerate(sorted(camera.iterdir())[:2]):
+            shutil.copy(image, own / f"image_{index:04d}.jpg")
+    (tmp_path / "demo.toml").write_text(MINI_TOML)
+    return tmp_path
+
+
+def test_the_page_is_one_screen():
+    assert len(CAMERAS_ONLY.splitlines()) <= 40
+    assert [words[0] for words in CAMERAS_COMMANDS] == ["project-debug", "run", "viz"]
+
+
+@pytest.mark.slow
+def test_the_commands_of_cameras_only_run(numbered_images):
+    debug, run, viz = CAMERAS_COMMANDS
+    done = command(numbered_images, *debug)
+    assert done.returncode == 0, done.stderr
+    assert "my_drive: 6 cameras" in done.stdout
+    assert (numbered_images / "runs/my_drive-project-debug/cameras.png").exists()
+    done = command(numbered_images, *run, "--model", "demo.toml", "--untrained", "--out", "runs/my_drive-photographs")
+    assert done.returncode == 0, done.stderr
+    assert "numbered images at 2 Hz, none of 12 images missing" in done.stderr
+    assert command(numbered_images, *viz, "--summary").returncode == 0
