@@ -15,7 +15,7 @@ from readers import READERS
 from seed_files import write_seeds
 from worker import Worker
 
-CASES = int(os.environ.get("BEVCLI_FUZZ_CASES", "7"))  # of each of the readers: more than 300 in all
+CASES = int(os.environ.get("BEVCLI_FUZZ_CASES", "4"))  # of each of the readers: more than 200 in all
 SAVE = os.environ.get("BEVCLI_FUZZ_SAVE")
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="limits are measured on Linux")

@@ -1,4 +1,4 @@
-"""BEVFormerV2 in a run: its window of image features, at scene starts, gaps and cuts, and with later frames."""
+"""The history of a run at scene starts, gaps and cuts: a BEVFormer's BEV map, and BEVFormerV2's window of frames."""
 
 import gc
 from dataclasses import replace
@@ -73,14 +73,21 @@ def test_the_state_has_a_fixed_length(window_model):
         assert [len(state.memory.frames) for _, _, state in steps] == lengths
 
 
-@pytest.mark.parametrize("cut", [1, 2, 4])
-def test_a_run_cut_in_two_equals_the_whole(window_model, cut):
-    model, sequence = window_model(-2, -1, 0), MemoryDrive(5)
-    whole, _ = run(model, sequence)
-    first, state = run(model, sequence, range(cut))
-    second, _ = run(model, sequence, range(cut, 5), state)
-    for one, other in zip(whole, first + second, strict=True):
-        assert_same(one, other)
+@pytest.fixture
+def models(mini_model, window_model):
+    """A function: the frames of windows -> a BEVFormer, and a BEVFormerV2 of each window."""
+    return lambda *windows: [mini_model, *(window_model(*frames) for frames in windows)]
+
+
+def test_a_run_cut_in_two_equals_the_whole(models):
+    sequence = MemoryDrive(5)
+    for model in models((-2, -1, 0)):
+        whole, _ = run(model, sequence)
+        for cut in (1, 2, 4):
+            first, state = run(model, sequence, range(cut))
+            second, _ = run(model, sequence, range(cut, 5), state)
+            for one, other in zip(whole, first + second, strict=True):
+                assert_same(one, other)
 
 
 def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
@@ -95,9 +102,10 @@ def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
         assert_same(one, other)
 
 
-def test_a_scene_change_inside_the_window_equals_a_fresh_start(window_model):
-    for frames in [(-3, -2, -1, 0), (-1, 0, 1)]:
-        model, sequence = window_model(*frames), MemoryDrive(5, scenes="aaabb")
+def test_a_scene_change_equals_a_fresh_start(models):
+    """Inside a window too."""
+    sequence = MemoryDrive(5, scenes="aaabb")
+    for model in models((-3, -2, -1, 0), (-1, 0, 1)):
         whole, _ = run(model, sequence)
         assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "", "new scene", ""]
         for places in (range(3), range(3, 5)):
@@ -106,21 +114,21 @@ def test_a_scene_change_inside_the_window_equals_a_fresh_start(window_model):
                 assert_same(whole[place], prediction)
 
 
-def test_a_gap_in_time_starts_anew(window_model):
+def test_a_gap_in_time_starts_anew(models):
     sequence = MemoryDrive(2, step_s=2.5)
-    for frames in [(-1, 0), (0, 1)]:
-        predictions, _ = run(window_model(*frames), sequence)
-        alone, _ = run(window_model(*frames), sequence, [1])
+    for model in models((-1, 0), (0, 1)):
+        predictions, _ = run(model, sequence)
+        alone, _ = run(model, sequence, [1])
         assert str(predictions[1].started_anew) == "gap of 2.5 s"
         assert_same(predictions[1], alone[0])
 
 
-def test_without_history_every_frame_stands_alone(window_model):
+def test_without_history_every_frame_stands_alone(models):
     sequence = MemoryDrive(3)
-    for frames in [(-1, 0), (-1, 0, 1)]:
-        predictions, _ = run(window_model(*frames), sequence, temporal=False)
+    for model in models((-1, 0), (-1, 0, 1)):
+        predictions, _ = run(model, sequence, temporal=False)
         assert {str(p.started_anew or "") for p in predictions} == {"history is off"}
-        alone, _ = run(window_model(*frames), sequence, [1], temporal=False)
+        alone, _ = run(model, sequence, [1], temporal=False)
         assert_same(predictions[1], alone[0])
 
 
@@ -143,11 +151,12 @@ def test_a_model_of_one_frame_says_that_it_uses_no_history(window_model):
     assert {str(p.started_anew or "") for p in predictions} == {"the model uses no history"}
 
 
-def test_a_frame_without_images_passes_the_state_on(window_model):
-    for frames in [(-1, 0), (-1, 0, 1, 2)]:
-        model = window_model(*frames)
+def test_a_frame_without_images_passes_the_state_on(models):
+    for model in models((-1, 0), (-1, 0, 1, 2)):
         predictions, _ = run(model, WithoutImages({1: "all"}, count=4))
         assert [p.skipped for p in predictions] == [False, True, False, False]
+        assert len(predictions[1].boxes) == 0
+        assert predictions[2].started_anew is None
         spanned, _ = run(model, MemoryDrive(4), [0, 2, 3])
         assert_same(predictions[2], spanned[1])
 

@@ -19,26 +19,11 @@ from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
 
 
-def assert_same(one, other):
-    assert one.bev.numpy() == pytest.approx(other.bev.numpy(), abs=1e-6)
-    assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-5)
-    assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-6)
-
-
 def test_history_matters(mini_model):
     sequence = MemoryDrive(2)
     with_history, without = run(mini_model, sequence)[0][1], run(mini_model, sequence, temporal=False)[0][1]
     assert (with_history.bev - without.bev).abs().max() > 1e-3
     assert (with_history.started_anew, str(without.started_anew)) == (None, "history is off")
-
-
-def test_a_run_cut_in_two_equals_the_whole(mini_model):
-    sequence = MemoryDrive(4)
-    whole, _ = run(mini_model, sequence)
-    first, state = run(mini_model, sequence, range(2))
-    second, _ = run(mini_model, sequence, range(2, 4), state)
-    for one, other in zip(whole, first + second, strict=True):
-        assert_same(one, other)
 
 
 def test_autocast_around_a_run_has_no_effect(mini_model):
@@ -48,29 +33,6 @@ def test_autocast_around_a_run_has_no_effect(mini_model):
         found, _ = run(prepared, MemoryDrive(2))
     assert torch.equal(found[1].bev, expected[1].bev)
     assert np.array_equal(found[1].boxes.centers, expected[1].boxes.centers)
-
-
-def test_a_new_scene_equals_a_fresh_start(mini_model):
-    whole, _ = run(mini_model, MemoryDrive(4, scenes="aabb"))
-    fresh, _ = run(mini_model, MemoryDrive(4, scenes="aabb"), range(2, 4))
-    assert [str(p.started_anew or "") for p in whole] == ["first frame", "", "new scene", ""]
-    assert_same(whole[2], fresh[0])
-    assert_same(whole[3], fresh[1])
-
-
-def test_a_gap_in_time_starts_anew(mini_model):
-    predictions, _ = run(mini_model, MemoryDrive(2, step_s=2.5))
-    assert str(predictions[1].started_anew) == "gap of 2.5 s"
-
-
-def test_a_frame_without_images_passes_the_state_on(mini_model):
-    sequence = WithoutImages({1: "all"}, count=3)
-    predictions, _ = run(mini_model, sequence)
-    assert [p.skipped for p in predictions] == [False, True, False]
-    assert len(predictions[1].boxes) == 0
-    assert predictions[2].started_anew is None
-    spanned, _ = run(mini_model, MemoryDrive(3), [0, 2])
-    assert_same(predictions[2], spanned[1])
 
 
 @pytest.mark.parametrize(
