@@ -40,7 +40,7 @@ SURE, REPEATED_M = 0.3, 2.0  # boxes that are looked for: score, error
 LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
 BEST = 15  # boxes of a frame whose scores are averaged
 BETTER = 0.015  # what the right order of colours gains of it; the wrong one loses 0.03 to 0.11
-LEAST_FOUND = 0.1  # share of what the witness sees that sound weights find
+LEAST_FOUND = 0.3  # share of what the witness sees that sound weights find: 0.55 or more where they know such images
 
 
 class ReversedColors(DerivedDrive):
