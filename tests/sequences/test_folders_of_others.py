@@ -54,6 +54,32 @@ def test_cameras_without_images_are_left_out_with_a_note(tmp_path):
     assert open_sequence(drive, **how).rig.names == ("cam0", "cam1", "cam3")
 
 
+@pytest.mark.parametrize("axes", ["flu", "rfu"])
+def test_a_rig_that_stands_is_alike_on_both_sides(tmp_path, axes):
+    """One image of cameras whose names say no direction: the axes are those with the same cameras left and right."""
+    drive, path = images_of(tmp_path / "drive", "cam0", "cam3", count=1), kalibr_of(tmp_path, 6)
+    if axes == "rfu":
+        cameras = yaml.safe_load(path.read_text())
+        for camera in cameras.values():
+            turned = np.eye(4)
+            turned[:2, :2] = [[0, 1], [-1, 0]]
+            camera["T_cam_imu"] = (np.array(camera["T_cam_imu"]) @ turned).tolist()
+        path.write_text(yaml.safe_dump(cameras))
+    how = {"calibration": path, "image_rate_hz": 2, "ego_motion": "static"}
+    sequence = open_sequence(drive, **how)
+    for name, own in (("cam0", "CAM_FRONT"), ("cam3", "CAM_BACK")):
+        stated = FACTS[own]["ego_from_camera"]
+        np.testing.assert_allclose(sequence.rig[name].ego_from_camera[:3, :3], stated["rotation"], atol=1e-6)
+        np.testing.assert_allclose(sequence.rig[name].ego_from_camera[:3, 3], stated["translation"], atol=1e-6)
+    other = {"flu": "rfu", "rfu": "flu"}[axes]
+    assert f"6 of 6 cameras are alike on both sides, with --rig-axes {other} 0" in " ".join(sequence.notes)
+    assert open_sequence(drive, **how, rig_axes=other).rig["cam0"].yaw == pytest.approx(
+        -np.pi / 2 if axes == "flu" else np.pi / 2
+    )
+    with pytest.raises(InputError, match="the images are not compared: pass `--rig-axes"):
+        open_sequence(drive, **how, image_check=False)
+
+
 def test_a_sequence_folder_may_have_images_of_some_cameras(tmp_path):
     images_of(tmp_path / "images", "CAM_FRONT", "CAM_BACK")
     shutil.copy(STREET / "calibration.json", tmp_path)

@@ -29,6 +29,7 @@ LEAST_UPRIGHT = 0.5  # z of the direction that is up in the image
 # Cameras look outwards: the mean of how far they lie in their own viewing direction, at least minus this.
 INWARDS_M = 0.05
 FARTHEST_OFF = np.radians(70)  # of a viewing direction from that of the camera's name
+SAME_SIDE, SAME_PLACE_M = np.radians(5), 0.15  # of a camera and of one on the other side of the vehicle
 SIDES = {"front|forward|ahead": 1, "back|rear": -1, "left": 1j, "right": -1j}  # in names, and where they are
 TOLERANCE = 1e-3
 Fields: TypeAlias = dict[str, Any]
@@ -239,6 +240,18 @@ def _impossible(rig: Mapping[str, Array], *, height_stated: bool) -> tuple[str, 
                 return "unit", f"{name} is {pose[2, 3]:.0f} m above the origin (in millimetres?)"
             return "height", f"{name} is {pose[2, 3]:.2f} m above the origin"
     return None
+
+
+def on_both_sides(rig: Mapping[str, Array]) -> int:
+    """The number of cameras with one like them on the other side, or that look along the vehicle in its middle."""
+    cameras = [(complex(*pose[:2, 2]), complex(*pose[:2, 3])) for pose in rig.values()]
+    return sum(
+        any(
+            abs(np.angle(other * forward)) < SAME_SIDE and abs(at.conjugate() - place) < SAME_PLACE_M
+            for other, place in cameras
+        )
+        for forward, at in cameras
+    )
 
 
 def side_of(camera: str) -> complex:

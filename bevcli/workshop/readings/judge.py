@@ -17,6 +17,7 @@ from bevcli.sequences.files.readings import PoseReading, Reading, RigReading, di
 from bevcli.sequences.images import ListedDrive
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.calibrations import poses_in_words
+from bevcli.workshop.formats.camera_poses import on_both_sides
 from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.odometry.stated import Poses
@@ -203,13 +204,29 @@ class _Judged:
             left = [each for each in found if each.is_forward] or found
         left = [each for index, each in enumerate(left) if not any(each.is_like(other) for other in left[:index])]
         if len(left) > 1:
-            raise self._question(left)
+            return self._on_both_sides(left)
         others = [each for each in found if not each.is_like(left[0])]
         if not others or not np.isfinite(best.residual_px):
             return left[0], ""
         names = differing([left[0].whole, others[0].whole])
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
+
+    def _on_both_sides(self, left: Sequence[Candidate]) -> tuple[Candidate, str]:
+        """The one of several axes of a rig in which most cameras have one like them on the other side of the vehicle.
+
+        Raises InputError where more than these axes are open, or several are alike in this.
+        """
+        counts = [on_both_sides(each.rig.ego_from_camera) if each.rig else 0 for each in left]
+        most = max(counts)
+        are_axes = differing([each.whole for each in left]) == ["rig_axes"] and self._options.image_check
+        if not are_axes or counts.count(most) > 1:
+            raise self._question(left)
+        chosen = left[counts.index(most)]
+        others = [f"with {each.whole.flags(['rig_axes'])} {count}"
+                  for each, count in zip(left, counts, strict=True) if each is not chosen]  # fmt: skip
+        alike = f"{most} of {len(self._draft.readings[0].ego_from_camera)} cameras are alike on both sides"
+        return chosen, f"the images do not tell; {alike}, {', '.join(others)}"
 
     def _question(self, left: Sequence[Candidate]) -> InputError:
         """The error that names the readings left, and the options that decide."""
