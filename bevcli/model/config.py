@@ -170,6 +170,10 @@ class ModelConfig:
         channels: C, of all tokens and queries.
         heads: what is computed from the BEV map; "segmentation" adds the head that `segmentation` configures.
         backbone: the image backbone, of the kind that its key `kind` names.
+        backbone_scale: it sees the images of the network's input at this share of their size, numerator and
+            denominator; a detector beside it sees them whole.
+        image_detector: a detector beside the backbone, for the boxes in the images. None: the backbone itself, if it
+            is one, tells these boxes.
         neck: the feature pyramid network.
         image_tokens: camera and level embeddings.
         ego_motion: can-bus numbers and alignment of the history.
@@ -195,6 +199,8 @@ class ModelConfig:
     channels: int = 256
     heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
     backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = field(default_factory=ResNetConfig)
+    backbone_scale: tuple[int, int] = (1, 1)
+    image_detector: NanoDetConfig | None = None
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
@@ -212,8 +218,11 @@ class ModelConfig:
         if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
             raise ValueError("bev_grid: each range goes from a smaller to a larger number")
         object_classes(self.classes, self.class_settings)
-        if self.hybrid_queries.count and not isinstance(self.backbone, NanoDetConfig):
-            raise ValueError('hybrid_queries needs a backbone that is a detector, such as "nanodet"')
+        if self.hybrid_queries.count and self.detector is None:
+            raise ValueError('hybrid_queries needs image_detector, or a backbone that is a detector, such as "nanodet"')
+        smaller, whole = self.backbone_scale
+        if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
+            raise ValueError("backbone_scale must be at most 1, and image.pad_divisor times it a whole number")
         if not self.cameras or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
             raise ValueError("cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
         if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):
@@ -251,6 +260,8 @@ class ModelConfig:
     def level_shapes_of(self, image_size: tuple[int, int]) -> LevelShapes:
         """(height, width) of each of these levels for images of another size (height, width), pixels."""
         height, width = image_size
+        smaller, whole = self.backbone_scale
+        height, width = height * smaller // whole, width * smaller // whole
         strides = sorted(self.backbone.output_strides())
         while len(strides) < self.neck.levels:
             strides.append(2 * strides[-1])
@@ -269,7 +280,12 @@ class ModelConfig:
     @property
     def image_classes(self) -> tuple[str, ...]:
         """The classes of the boxes in the images, in the order of their labels; empty without a detector."""
-        return IMAGE_CLASSES if isinstance(self.backbone, NanoDetConfig) else ()
+        return () if self.detector is None else IMAGE_CLASSES
+
+    @property
+    def detector(self) -> NanoDetConfig | None:
+        """What tells the boxes in the images: the detector beside the backbone, or the backbone where it is one."""
+        return self.backbone if isinstance(self.backbone, NanoDetConfig) else self.image_detector
 
     @property
     def results(self) -> Mapping[type[FrameResult], tuple[str, ...]]:

@@ -17,30 +17,40 @@ from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 from bevcli.model.pillar_projection import project_points
 
+GROUP_COUNT = 4
 # Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
 GROUPS = {
     **dict.fromkeys(("car", "bus", "truck", "trailer"), 1),
     **dict.fromkeys(("person", "pedestrian"), 2),
     **dict.fromkeys(("bicycle", "motorcycle"), 3),
 }
-# Logarithms of the shares that it misses, by group: of rendered cars a third, of people a seventh.
-MISSED = (0.0, -1.1, -1.9, -1.1)
-MARGIN, SURE = 0.15, 0.3  # of the sides of a box, in which an object's centre lies; score that counts as found
+SURE, SMALLEST = 0.35, 14.0  # score and height in pixels from which on a box in an image must be explained
+EXPLAINED = 0.2, 0.6  # intersection over union with a learned box, from none to all of it explained
+CLAIMED = 0.35  # score of the learned box that explains all of it
+EXPECTED, PRIOR = 0.2, 3.0  # share that is explained before anything was seen, and the sum of scores that this weighs
+TRUSTED = 0.3, 0.45  # share of explained boxes, from no to full trust in the learned queries
+DOUBT, YIELD = 2.0, 3.0  # taken from the logits of learned queries without trust, and of hybrid ones with full trust
+NEAREST_M = 0.3  # of the corners of a box that a camera sees
+LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
 RANGE_SCALE = 0.05  # of metres, as they enter a layer
+CORNERS = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])  # of a box
 
 
 @dataclass(frozen=True)
 class HybridQueriesConfig:
-    """The [hybrid_queries] table of a model whose backbone is a detector.
+    """The [hybrid_queries] table of a model with a detector.
 
     Attributes:
         count: of queries, the best boxes of all cameras; 0 for none.
         layers: that correct them by the BEV map; with 0 they stay as `Lift` gives them.
-        features: channels of the backbone's maps.
+        level: whether the rig of each frame is levelled first, by the slope of the road that the boxes tell, where the
+            detector stands beside the backbone: the vehicle pitches and rolls, and poses rarely state it.
+        features: channels of the detector's maps.
     """
 
     count: int = 0
     layers: int = 0
+    level: bool = False
     features: int = 128
 
     def __post_init__(self) -> None:
@@ -55,7 +65,6 @@ class HybridQueries(nn.Module):
     range_extent: Tensor
     of_image: Tensor  # (7, groups)
     of_class: Tensor  # (classes, groups)
-    missed: Tensor  # (groups,)
 
     def __init__(
         self,
@@ -79,9 +88,8 @@ class HybridQueries(nn.Module):
             for weights in (*self.class_correction.parameters(), *self.box_correction.parameters()):
                 nn.init.zeros_(weights)
         of_image, of_class = ([GROUPS.get(name, 0) for name in names] for names in (IMAGE_CLASSES, classes))
-        self.register_buffer("of_image", torch.eye(len(MISSED))[of_image], persistent=False)
-        self.register_buffer("of_class", torch.eye(len(MISSED))[of_class], persistent=False)
-        self.register_buffer("missed", torch.tensor(MISSED), persistent=False)
+        self.register_buffer("of_image", torch.eye(GROUP_COUNT)[of_image], persistent=False)
+        self.register_buffer("of_class", torch.eye(GROUP_COUNT)[of_class], persistent=False)
         ranges = torch.tensor([grid.x_range_m, grid.y_range_m])
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
         self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
@@ -96,7 +104,7 @@ class HybridQueries(nn.Module):
             sizes: (B, N, 2) width and height of the images within their padding, pixels.
         """
         with torch.no_grad():
-            logits, codes, _ = self.lift(boxes, image_from_bev, sizes)
+            logits, codes, *_ = self.lift(boxes, image_from_bev, sizes)
             place = (codes[..., :2] - self.range_start) / self.range_extent
             is_inside = ((place > 0) & (place < 1)).all(-1, keepdim=True)
             logits = logits.where(is_inside, NO_BOX)
@@ -116,22 +124,96 @@ class HybridQueries(nn.Module):
             query = layer(query, position, place, bev)
         return logits + self.class_correction(query), codes + self.box_correction(query)
 
-    def weighed(
-        self, class_logits: Tensor, box_codes: Tensor, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor
-    ) -> Tensor:
-        """The class logits (L, B, Q, classes) of other queries, lower where the detector looked and saw nothing.
+    @torch.no_grad()
+    def levelled(self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> Tensor:
+        """(B, N, 4, 4), on the CPU where image_from_bev is: pixels from a bev frame that is level with the road.
 
-        An object that a camera sees and its detector does not is one of those that it misses, or none: by Bayes' rule
-        the logit falls by the logarithm of the share that it misses. box_codes: (L, B, Q, 10). Others: see `forward`.
+        It is turned about the point of the road below its origin, and the less, the less sure the slope is. Arguments:
+        see `forward`.
         """
-        x, y, _, _, z, *_ = box_codes[-1].float().unbind(-1)
-        centers = torch.stack([x, y, z], -1)[:, None]  # (B, 1, Q, 3)
-        place, depth = project_points(image_from_bev[:, :, None], centers)  # (B, N, Q, 2), (B, N, Q)
-        tells = boxes.scores.amax(-1, keepdim=True) > 0  # an image in which nothing at all is found tells nothing
-        is_seen = tells & (depth > 1) & (place > 0).all(-1) & (place < sizes[:, :, None]).all(-1)
-        start, end = boxes.boxes[:, :, None].split(2, -1)  # (B, N, 1, K, 2)
-        margin = MARGIN * (end - start)
-        hit = ((place[..., None, :] > start - margin) & (place[..., None, :] < end + margin)).all(-1)  # (B, N, Q, K)
-        sureness = (boxes.scores / SURE).clamp(max=1)[:, :, None] * hit
-        found = (sureness[..., None] * self.of_image[boxes.labels][:, :, None]).amax((1, 3))  # (B, Q, groups)
-        return class_logits + (self.missed * (1 - found) * is_seen.any(1)[..., None]) @ self.of_class.T
+        device = boxes.boxes.device
+        *_, slopes, covariance = self.lift(boxes, image_from_bev.to(device), sizes.to(device))
+        (xx, xy), (_, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
+        x, y = slopes.unbind(-1)
+        sureness = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)  # in squares of standard deviations
+        slopes = (slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]).to(image_from_bev.device)
+        one, zero = torch.ones_like(slopes[:, :1]), torch.zeros_like(slopes[:, :1])
+        forward, up = torch.cat([one, zero, slopes[:, :1]], -1), torch.cat([-slopes, one], -1)
+        x, z = F.normalize(forward, dim=-1), F.normalize(up, dim=-1)
+        bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
+        bev_from_level[:, :3, :3] = torch.stack([x, torch.linalg.cross(z, x), z], -1)
+        bev_from_level[:, :3, 3] = self.lift.ground_z * (zero.new_tensor([0.0, 0.0, 1.0]) - z)
+        return image_from_bev @ bev_from_level[:, None]
+
+    def weighed(
+        self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """The logits of the learned and of the hybrid queries, weighed by the trust in the learned ones.
+
+        Where these explain what the detector sees, as on renderings, their places are the better ones; where they do
+        not, as on photographs, those that start from its boxes are.
+
+        Args:
+            outputs: logits (L, B, Q, classes) and box codes (L, B, Q, 10) of the learned queries.
+            hybrid_logits: (B, H, classes).
+            boxes: of N cameras.
+            cameras: image_from_bev of the rig that made the BEV map, and sizes, see `forward`.
+        """
+        logits, codes = outputs
+        with torch.no_grad():
+            explained, all_of_them = self.explained(logits[-1], codes[-1], boxes, *cameras)
+            share = (explained + EXPECTED * PRIOR) / (all_of_them + PRIOR)
+            trust = between(share, *TRUSTED)[:, None, None]
+        return logits - DOUBT * (1 - trust), hybrid_logits - YIELD * trust
+
+    def explained(
+        self, logits: Tensor, codes: Tensor, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The sum of the scores of the boxes in images that learned boxes explain, and that of all of them, (B,) each.
+
+        logits: (B, Q, classes). codes: (B, Q, 10). Others: see `forward`.
+        """
+        rectangles, is_seen = rectangles_of(codes, image_from_bev, sizes)  # (B, N, Q, 4), (B, N, Q)
+        of_box = self.of_image[boxes.labels]  # (B, N, K, groups)
+        claims = (logits.float().sigmoid() @ self.of_class)[:, None] @ of_box.transpose(-1, -2)  # (B, N, Q, K)
+        overlap = between(intersection_over_union(rectangles, boxes.boxes), *EXPLAINED) * is_seen[..., None]
+        explained = (overlap * between(claims, 0.0, CLAIMED)).amax(2)  # (B, N, K)
+        start, end, limit = *boxes.boxes.split(2, -1), sizes[:, :, None]
+        is_whole = ((start > 1) & (end < limit - 2.5)).all(-1)
+        counts = is_whole & (end - start)[..., 1].gt(SMALLEST) & boxes.scores.gt(SURE) & of_box[..., 0].eq(0)
+        weights = boxes.scores * counts
+        return (weights * explained).sum((1, 2)), weights.sum((1, 2))
+
+
+def between(x: Tensor, none: float, full: float) -> Tensor:
+    """0 up to `none`, 1 from `full` on, and straight between them."""
+    return ((x - none) / (full - none)).clamp(0, 1)
+
+
+def rectangles_of(codes: Tensor, image_from_bev: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+    """The rectangles (B, N, Q, 4) around boxes in the images, clipped, and whether a camera sees them (B, N, Q).
+
+    A camera sees a box that lies before it and of whose rectangle at least a third is in the image. codes: (B, Q, 10).
+    """
+    x, y, width, length, z, height, sin, cos, *_ = codes.float().unbind(-1)
+    half = torch.stack([length, width, height], -1).clamp(max=4).exp() / 2
+    forward, left, up = (CORNERS.to(half) * half[..., None, :]).unbind(-1)  # (B, Q, 8)
+    norm = (sin.square() + cos.square()).sqrt().clamp(min=1e-4)
+    cos_yaw, sin_yaw = -(sin / norm)[..., None], -(cos / norm)[..., None]  # the angle of a code is -yaw - pi / 2
+    place = [x[..., None] + forward * cos_yaw - left * sin_yaw, y[..., None] + forward * sin_yaw + left * cos_yaw]
+    corners = torch.stack([*place, z[..., None] + up], -1)[:, None]  # (B, 1, Q, 8, 3)
+    pixels, depth = project_points(image_from_bev[:, :, None, None], corners)
+    low, high, limit = pixels.amin(-2), pixels.amax(-2), sizes[:, :, None] - 0.5
+    whole = (high - low).prod(-1)
+    low, high = (torch.minimum(corner.clamp(min=-0.5), limit) for corner in (low, high))
+    inside = (high - low).prod(-1)
+    return torch.cat([low, high], -1), (depth > NEAREST_M).all(-1) & (inside > 0.3 * whole) & (inside > 16)
+
+
+def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
+    """(..., Q, K) of rectangles (..., Q, 4) and (..., K, 4)."""
+    a, b = a[..., :, None, :], b[..., None, :, :]
+    low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
+    shared = (high - low).clamp(min=0).prod(-1)
+    areas = [(x[..., 2:] - x[..., :2]).clamp(min=0).prod(-1) for x in (a, b)]
+    return shared / (areas[0] + areas[1] - shared).clamp(min=1e-3)

@@ -70,11 +70,14 @@ class Lift(nn.Module):
             for weights in last.parameters():
                 nn.init.zeros_(weights)
 
-    def forward(self, found: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Class logits (B, N · K, classes), box codes (B, N · K, 10) and the slopes of the ground (B, 2) along x and y.
+    def forward(
+        self, found: ImageBoxes, image_from_bev: Tensor, sizes: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Class logits (B, N · K, classes), box codes (B, N · K, 10), slopes of the ground (B, 2), their covariance.
 
-        The codes are those of `decoder.encode`, in the level bev frame of the vehicle; velocities are 0. A box that
-        stands there once for each of several classes counts once.
+        The slopes are those along x and y, their covariance is (B, 2, 2). The codes are those of `decoder.encode`, in
+        the level bev frame of the vehicle; velocities are 0. A box that stands there once for each of several classes
+        counts once.
 
         Args:
             found: boxes in pixels of the network's input.
@@ -119,7 +122,7 @@ class Lift(nn.Module):
         codes = [x, y, size[..., 0], size[..., 1], z, size[..., 2], -cos, -sin, 0 * x, 0 * x]
         class_logits = self.class_scale * (logits @ self.known.T) + (1 - self.known.sum(-1)) * UNKNOWN + correction
         class_logits = torch.where(is_box[..., None], class_logits, NO_BOX)
-        return class_logits.flatten(1, 2), torch.stack(codes, -1).flatten(1, 2), slopes
+        return class_logits.flatten(1, 2), torch.stack(codes, -1).flatten(1, 2), slopes, covariance
 
     def _slopes(self, seen: Tensor, scores: Tensor, rays: "Rays", distances: Tensor) -> tuple[Tensor, Tensor]:
         """The slopes (B, 2) of the ground along x and y that fit all boxes best, and their covariance (B, 2, 2).

@@ -103,10 +103,14 @@ class NanoDet(Backbone):
     def forward(self, images: Tensor) -> list[Tensor]:
         """The three maps of the head, of which the neck takes the first.
 
-        images: (B, 3, H, W), H and W multiples of 32 -> (B, 128, H / stride, W / stride), strides 8, 16 and 32.
+        images: (B, 3, H, W) -> (B, 128, H / stride, W / stride), strides 8, 16 and 32, after padding at right and bottom
+            to multiples of 32.
         """
         if self.frozen_maps is not None:
             return self.frozen_maps(images)
+        height, width = images.shape[-2:]
+        if height % STRIDES[-1] or width % STRIDES[-1]:
+            images = F.pad(images, (0, -width % STRIDES[-1], 0, -height % STRIDES[-1]))
         x = F.max_pool2d(self.conv1(images), 3, stride=2, padding=1)
         maps: list[Tensor] = []
         for stage in self.stages:

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch.nn.functional as F
 from torch import Tensor
 
 from bevcli.errors import BevcliError
@@ -14,12 +15,13 @@ from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
 from bevcli.model.hybrid_queries import HybridQueries
+from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
-from bevcli.model.upload import without_autocast
+from bevcli.model.upload import on_device, upload_together, without_autocast
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -38,6 +40,7 @@ class Network(TemporalModel):
         grid, channels, levels = config.bev_grid, config.channels, config.encoder_levels
         bev_shape = (grid.rows, grid.columns)
         self.backbone = config.backbone.build()
+        self.image_detector = config.image_detector.build() if config.image_detector else None
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         embeds_rays = config.image_tokens.calibration_embedding
@@ -64,8 +67,20 @@ class Network(TemporalModel):
 
     def image_maps(self, images: Tensor) -> list[Tensor]:
         """The maps of the backbone for B·N images. images: (B, N, 3, H, W), normalised, padded."""
-        maps: list[Tensor] = self.backbone(images.flatten(0, 1))
+        images, (smaller, whole) = images.flatten(0, 1), self.config.backbone_scale
+        if smaller < whole:
+            size = [extent * smaller // whole for extent in images.shape[-2:]]
+            images = F.interpolate(images, size, mode="bilinear", align_corners=False)
+        maps: list[Tensor] = self.backbone(images)
         return maps
+
+    @on_device
+    def find_image_boxes(self, images: Tensor, has_image: Tensor, image_sizes: Tensor) -> ImageBoxes:
+        """The boxes that the detector beside the backbone finds. Arguments: see `ModelInputs`."""
+        images, has_image, image_sizes = upload_together((images, has_image, image_sizes), self.device)
+        maps = self.image_detector(images.flatten(0, 1))
+        boxes: ImageBoxes = self.image_detector.image_boxes(maps, has_image, image_sizes)
+        return boxes
 
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""
@@ -82,19 +97,25 @@ class Network(TemporalModel):
         return ModelOutputs(bev, class_logits, box_codes, segmentation)
 
     def detect_with_images(
-        self, bev: Tensor, maps: list[Tensor], has_image: Tensor, image_from_bev: Tensor, image_sizes: Tensor
+        self,
+        bev: Tensor,
+        boxes: ImageBoxes | None,
+        image_from_bev: Tensor,
+        image_from_level: Tensor,
+        image_sizes: Tensor,
     ) -> ModelOutputs:
         """As `detect`, with the boxes in the images, and the queries that start from them, where the model has these.
 
-        maps: of `image_maps`. Others: see `ModelInputs`.
+        image_from_bev, image_sizes: see `ModelInputs`. image_from_level: as image_from_bev, of the rig that made `bev`.
         """
         outputs = self.detect(bev)
-        boxes, cameras = self.backbone.image_boxes(maps, has_image, image_sizes), (image_from_bev, image_sizes)
         if self.hybrid_queries is not None and boxes is not None:
             with without_autocast(bev.device):
-                logits = self.hybrid_queries.weighed(outputs.class_logits, outputs.box_codes, boxes, *cameras)
-                hybrid = self.hybrid_queries(bev.float(), boxes, *cameras)
-                outputs = replace(outputs, class_logits=logits).with_queries(*hybrid)
+                hybrid_logits, hybrid_codes = self.hybrid_queries(bev.float(), boxes, image_from_bev, image_sizes)
+                learned = outputs.class_logits, outputs.box_codes
+                cameras = image_from_level, image_sizes
+                logits, hybrid_logits = self.hybrid_queries.weighed(learned, hybrid_logits, boxes, cameras)
+                outputs = replace(outputs, class_logits=logits).with_queries(hybrid_logits, hybrid_codes)
         return replace(outputs, image_boxes=boxes)
 
     def history_of_clip(self, clip: Clip, frame: int, memory: Any) -> Any:
@@ -136,6 +157,7 @@ class Network(TemporalModel):
         yield "backbone: stem", *(f"backbone.{name}" for name in self.backbone.stem_parts)
         for stage, name in enumerate(self.config.backbone.stage_names()):
             yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
+        yield "detector of boxes in the images", "image_detector"
         yield "neck (FPN)", "neck"
         yield "level embeddings", "image_tokens.level_embedding"
         yield "camera embeddings", "image_tokens.camera_embedding"

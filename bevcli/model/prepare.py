@@ -63,9 +63,11 @@ def prepare_for_inference(model: TemporalModel, device: torch.device, precision:
         gpu.finish_gpu_parts(network, points_on_cpu)
     dtype = DTYPES[precision]
     if isinstance(network, Network):
-        network.backbone.to(dtype)
         network.neck.to(dtype)
-        network.backbone.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
+        for backbone in (network.backbone, network.image_detector):
+            if backbone is not None:
+                backbone.to(dtype)
+                backbone.register_forward_pre_hook(lambda _, images: (images[0].to(dtype), *images[1:]))
     rounds = precision == "bf16" and device.type == "cpu" and has_matrix_unit()
     if dtype != torch.float32:
         round_attentions(network, dtype, temporal=rounds, queries=rounds or device.type == "cuda")

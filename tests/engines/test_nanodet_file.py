@@ -19,14 +19,21 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("openvino")
 
 
-@pytest.fixture(scope="module")
-def model():
+BESIDE = {"image_detector": NanoDetConfig(), "backbone_scale": (1, 2)}
+
+
+@pytest.fixture(scope="module", params=["backbone", "beside"])
+def model(request):
     """Random weights of a size that gives boxes with scores of all sizes."""
-    model = model_for_engines(NanoDetConfig(), hybrid_queries=20)
+    if request.param == "backbone":
+        model = model_for_engines(NanoDetConfig(), hybrid_queries=20)
+    else:
+        model = model_for_engines(hybrid_queries=20, **BESIDE)
     with torch.random.fork_rng():
         torch.manual_seed(1)
         state = NanoDetConfig().build().state_dict()
-    model.backbone.load_state_dict({key: 0.3 * x if "gfl_cls" in key else x for key, x in state.items()})
+    detector = model.image_detector or model.backbone
+    detector.load_state_dict({key: 0.3 * x if "gfl_cls" in key else x for key, x in state.items()})
     return model
 
 

@@ -58,7 +58,9 @@ FAST_BACKBONE = ResNetConfig((1, 1, 1, 1), "pytorch", output_stages=(3, 4), defo
 
 
 def model_for_engines(
-    backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = FAST_BACKBONE, hybrid_queries: int = 0
+    backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = FAST_BACKBONE,
+    hybrid_queries: int = 0,
+    **changes: object,
 ) -> BEVFormer:
     """A small model without deformable convolutions, which OpenVINO lacks; duplicates of its boxes merge and fade."""
     return small_model(
@@ -67,7 +69,8 @@ def model_for_engines(
         backbone=backbone,
         neck=FPNConfig(levels=2),
         image_tokens=ImageTokensConfig(level_embeddings=2, calibration_embedding=True),
-        hybrid_queries=HybridQueriesConfig(hybrid_queries),
+        hybrid_queries=HybridQueriesConfig(hybrid_queries, level="image_detector" in changes),
+        **changes,
     )
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from bevcli.geometry.transforms import Pose
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import map_rotation, turned_history
+from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
@@ -35,6 +36,9 @@ class EncoderInputs:
 
     Attributes:
         images: see `ModelInputs`, as for image_from_bev, camera_index, has_image, image_sizes, can_bus and shift.
+        image_from_level: (B, N, 4, 4), as image_from_bev, of the rig as the boxes in the images level it; hits and rays
+            are of this rig.
+        image_boxes: of a detector beside the backbone, None without one.
         hits: the cells that each camera sees.
         rays: scale and shift of the image features, of the calibration embedding; None without one.
         history: (B, Y·X, C), the BEV map of the previous frame; None without history.
@@ -43,6 +47,7 @@ class EncoderInputs:
 
     images: Tensor
     image_from_bev: Tensor
+    image_from_level: Tensor
     camera_index: Tensor
     has_image: Tensor
     image_sizes: Tensor
@@ -52,6 +57,7 @@ class EncoderInputs:
     rays: tuple[Tensor, Tensor] | None
     history: Tensor | None
     rotation: Tensor | None
+    image_boxes: ImageBoxes | None = None
 
 
 class BEVFormer(Network):
@@ -74,25 +80,31 @@ class BEVFormer(Network):
 
     def geometry(self, inputs: ModelInputs, history: Tensor | None) -> EncoderInputs:
         """The host part of a step: what it needs of calibration and poses, as tensors. Arguments as for `forward`."""
-        size = inputs.image_size
-        rays = rotation = None
+        size, image_from_level = inputs.image_size, inputs.image_from_bev
+        rays = rotation = boxes = None
+        if self.image_detector is not None:
+            boxes = self.find_image_boxes(inputs.images, inputs.has_image, inputs.image_sizes)
+            if self.hybrid_queries is not None and self.config.hybrid_queries.level:
+                image_from_level = self.hybrid_queries.levelled(boxes, image_from_level, inputs.image_sizes)
         if self.calibration_embedding is not None:
-            rays = self.calibration_embedding(inputs.image_from_bev, self.config.level_shapes_of(size), size)
+            rays = self.calibration_embedding(image_from_level, self.config.level_shapes_of(size), size)
         if history is not None:
             center = self.config.ego_motion.history_rotation_center
             rotation = map_rotation(inputs.rotation_deg, self.config.bev_grid, center)
         return EncoderInputs(
             images=inputs.images,
             image_from_bev=inputs.image_from_bev,
+            image_from_level=image_from_level,
             camera_index=inputs.camera_index,
             has_image=inputs.has_image,
             image_sizes=inputs.image_sizes,
             can_bus=inputs.can_bus,
             shift=inputs.shift,
-            hits=self.pillars(inputs.image_from_bev, size, inputs.has_image),
+            hits=self.pillars(image_from_level, size, inputs.has_image),
             rays=rays,
             history=history,
             rotation=rotation,
+            image_boxes=boxes,
         )
 
     @on_device
@@ -117,7 +129,9 @@ class BEVFormer(Network):
         )
         if not heads:
             return bev
-        return self.detect_with_images(bev, maps, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
+        boxes = inputs.image_boxes or self.backbone.image_boxes(maps, inputs.has_image, inputs.image_sizes)
+        cameras = inputs.image_from_bev, inputs.image_from_level, inputs.image_sizes
+        return self.detect_with_images(bev, boxes, *cameras)
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
         """See `TemporalModel`."""
@@ -143,7 +157,7 @@ class BEVFormer(Network):
         can_bus, shift, rotation = torch.empty(1, 18), torch.empty(1, 2), torch.empty(1, 2, 3)
         has_image = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
         projections, sizes = torch.eye(4).expand(*images.shape[:2], 4, 4), torch.ones(*images.shape[:2], 2)
-        cameras = projections, camera_index, has_image, sizes
+        cameras = projections, projections, camera_index, has_image, sizes
         self.compute(EncoderInputs(images, *cameras, can_bus, shift, hits, None, history, rotation))
 
     @classmethod

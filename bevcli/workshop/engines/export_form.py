@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
 from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, with_most_cameras
@@ -139,9 +138,9 @@ def _image_sizes_port(lead: tuple[int, int]) -> Port:
 
 def _image_box_ports(config: ModelConfig, cameras: int) -> Iterator[Port]:
     """The boxes in the images, of a backbone that is a detector."""
-    if not isinstance(config.backbone, NanoDetConfig):
+    if config.detector is None:
         return
-    shape = (1, cameras, config.backbone.max_boxes)
+    shape = (1, cameras, config.detector.max_boxes)
     yield Port(
         "image_boxes",
         (*shape, 4),

@@ -48,7 +48,7 @@ MIN_OPSET = {"operator": 19, "gridsample": 17}
 # of backbone and neck.
 METADATA = ("config", "cameras_per_cell", "untrained", "bundled", "precision")
 
-QUANTIZED_PARTS = ("backbone", "neck")
+QUANTIZED_PARTS = ("backbone", "image_detector", "neck")
 QUANTIZED_OPERATORS = ("Conv", "Add", "MaxPool")
 # Deformable convolutions stay in float32: rounding would move their samples.
 DEFORMABLE = {"convolution", "offset_and_mask"}

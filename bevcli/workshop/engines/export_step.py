@@ -108,10 +108,16 @@ class RecurrentStep(ExportedStep):
     ) -> tuple[Tensor, ...]:
         """One step; `RecurrentForm` documents every input and output."""
         network = self.network
-        maps = network.image_maps(self.normalised(images))
+        images, boxes, image_from_level = self.normalised(images), None, image_from_bev
+        if network.image_detector is not None:
+            assert image_sizes is not None
+            boxes = network.find_image_boxes(images, has_image, image_sizes)
+            if network.hybrid_queries is not None and self.config.hybrid_queries.level:
+                image_from_level = network.hybrid_queries.levelled(boxes, image_from_bev, image_sizes)
+        maps = network.image_maps(images)
         image_features = network.tokens_of(maps, camera_index)
         if network.calibration_embedding is not None:
-            rays = image_from_bev, image_features.level_shapes, self.image_size
+            rays = image_from_level, image_features.level_shapes, self.image_size
             image_features = image_features.scaled(*network.calibration_embedding(*rays))
         bev_query = network.bev_queries(can_bus)
         position = network.bev_queries.position()
@@ -119,14 +125,15 @@ class RecurrentStep(ExportedStep):
         history = rotate_history(previous_bev, rotation, self.config.bev_grid, center)
         centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
-        hits = self.hits(image_from_bev, has_image)
+        hits = self.hits(image_from_level, has_image)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
         for layer in network.encoder.layers:
             assert isinstance(layer, EncoderLayer)
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
-        outputs = network.detect_with_images(bev, maps, has_image, image_from_bev, image_sizes)
+        boxes = boxes or network.backbone.image_boxes(maps, has_image, image_sizes)
+        outputs = network.detect_with_images(bev, boxes, image_from_bev, image_from_level, image_sizes)
         boxes = outputs.image_boxes
         return (*self.outputs(outputs, hits.most_cameras), *(boxes.by_name.values() if boxes else ()))
 

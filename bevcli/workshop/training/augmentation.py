@@ -22,7 +22,7 @@ from torch import Tensor
 
 from bevcli.frame import CameraImage, Frame
 from bevcli.geometry.cameras import CameraRig, camera_pose_noise
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, rigid
 from bevcli.jit import njit
 from bevcli.model.config import ImageConfig
 from bevcli.model.upload import upload
@@ -73,6 +73,9 @@ class AugmentationConfig:
         drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
         calibration_share: probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip.
         calibration_noise: largest level of that noise (`camera_pose_noise`), drawn uniformly from 0.
+        tilted_share: probability (0 to 1) that the vehicle of a clip pitches and rolls, which its poses do not state.
+        tilt_deg: largest standard deviation of that pitch, drawn uniformly from 0; of the roll half as much. Half of
+            its variance is of the whole clip, as on a slope; each frame draws the rest anew.
         corrupted_share: probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness,
             motion blur or few colours, of any severity.
         lost_cameras_share: probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or
@@ -88,20 +91,21 @@ class AugmentationConfig:
     drop_image: float = 0.0
     calibration_share: float = 0.0
     calibration_noise: float = 4.0
+    tilted_share: float = 0.0
+    tilt_deg: float = 1.5
     corrupted_share: float = 0.0
     lost_cameras_share: float = 0.0
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:
-        amounts = ("exposure", "white_balance", "noise", "calibration_noise")
+        amounts = ("exposure", "white_balance", "noise", "calibration_noise", "tilt_deg")
         others = (*amounts, "randomisation")
         wrong = [name for name, share in vars(self).items() if name not in others and not 0 <= share <= 1]
         if wrong:
             raise ValueError(f"{wrong[0]} is a probability, from 0 to 1")
         if min(vars(self)[name] for name in amounts) < 0 or self.white_balance >= 1:
             raise ValueError(
-                "exposure, white_balance, noise and calibration_noise must not be negative, and white_balance must be "
-                "below 1"
+                f"{', '.join(amounts[:-1])} and {amounts[-1]} must not be negative, and white_balance must be below 1"
             )
 
 
@@ -117,9 +121,10 @@ def augmented(
     GPU.
     """
     vary_images, vary_rig = ImageVariation(config, random), CalibrationVariation(config, random)
+    tilt = BodyVariation(config, random)
     worsen, frames, distortions = BadConditions(config, random), [], []
     for frame in clip:
-        frames.append(vary_rig(worsen(vary_images(frame))))
+        frames.append(tilt(vary_rig(worsen(vary_images(frame)))))
         names = frames[-1].images if config.photometric else ()
         distortions.append({name: draw_color_change(config.photometric, random) for name in names})
     return frames, distortions
@@ -257,6 +262,28 @@ class CalibrationVariation:
             )
             self._noisy = (frame.rig, replace(frame.rig, cameras=cameras))
         return replace(frame, rig=self._noisy[1])
+
+
+class BodyVariation:
+    """Pitch and roll of the vehicle of one clip that its poses do not state.
+
+    The images stay; the cameras state the poses that they would have on a level vehicle which is tilted the other way.
+    """
+
+    def __init__(self, config: AugmentationConfig, random: np.random.Generator) -> None:
+        tilted = config.tilted_share > 0 and random.random() < config.tilted_share
+        deviation_deg = random.uniform(0, config.tilt_deg) if tilted else 0.0
+        self._deviation = np.radians(deviation_deg) * np.array([0.5, 1.0, 0.0]) / np.sqrt(2)  # about x, y, z
+        self._random, self._of_clip = random, self._deviation * random.standard_normal(3)
+
+    def __call__(self, frame: Frame) -> Frame:
+        """A copy of the frame whose cameras are tilted together, or the frame itself."""
+        if not self._deviation.any():
+            return frame
+        rotation, _ = cv2.Rodrigues(self._of_clip + self._deviation * self._random.standard_normal(3))
+        ego_from_tilted = rigid(np.zeros(3), rotation)
+        cameras = (replace(x, ego_from_camera=ego_from_tilted @ x.ego_from_camera) for x in frame.rig.cameras)
+        return replace(frame, rig=replace(frame.rig, cameras=tuple(cameras)))
 
 
 UNDISTORTED: ColorChange = (0.0, 1.0, 1.0, 0.0)

@@ -1,6 +1,6 @@
 """The second witness: a detector of people, cycles and vehicles in images, which learned from photographs alone.
 
-Its weights are those of the backbone of the model `photographs`. That model's own boxes in images are these.
+Its weights are those of the detector in the model `photographs`. That model's own boxes in images are these.
 """
 
 import csv
@@ -21,7 +21,7 @@ from bevcli.inference.image_boxes import camera_boxes
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
 
-SOURCE, PART = "photographs", "backbone."  # the model of the package whose weights have the detector's, and where
+SOURCE, PART = "photographs", "image_detector."  # the model of the package whose weights have the detector's, and where
 
 
 @dataclass(frozen=True)
