@@ -178,8 +178,8 @@ class HybridQueries(nn.Module):
         claims = (logits.float().sigmoid() @ self.of_class)[:, None] @ of_box.transpose(-1, -2)  # (B, N, Q, K)
         overlap = between(intersection_over_union(rectangles, boxes.boxes), *EXPLAINED) * is_seen[..., None]
         explained = (overlap * between(claims, 0.0, CLAIMED)).amax(2)  # (B, N, K)
-        start, end, limit = *boxes.boxes.split(2, -1), sizes[:, :, None]
-        is_whole = ((start > 1) & (end < limit - 2.5)).all(-1)
+        start, end = boxes.boxes.split(2, -1)
+        is_whole = ((start > 1) & (end < sizes[:, :, None] - 2.5)).all(-1)
         counts = is_whole & (end - start)[..., 1].gt(SMALLEST) & boxes.scores.gt(SURE) & of_box[..., 0].eq(0)
         weights = boxes.scores * counts
         return (weights * explained).sum((1, 2)), weights.sum((1, 2))

@@ -103,8 +103,7 @@ class NanoDet(Backbone):
     def forward(self, images: Tensor) -> list[Tensor]:
         """The three maps of the head, of which the neck takes the first.
 
-        images: (B, 3, H, W) -> (B, 128, H / stride, W / stride), strides 8, 16 and 32, after padding at right and bottom
-            to multiples of 32.
+        images: (B, 3, H, W), padded to multiples of 32 here -> (B, 128, H / stride, W / stride), strides 8, 16 and 32.
         """
         if self.frozen_maps is not None:
             return self.frozen_maps(images)

@@ -78,9 +78,8 @@ class Network(TemporalModel):
     def find_image_boxes(self, images: Tensor, has_image: Tensor, image_sizes: Tensor) -> ImageBoxes:
         """The boxes that the detector beside the backbone finds. Arguments: see `ModelInputs`."""
         images, has_image, image_sizes = upload_together((images, has_image, image_sizes), self.device)
-        maps = self.image_detector(images.flatten(0, 1))
-        boxes: ImageBoxes = self.image_detector.image_boxes(maps, has_image, image_sizes)
-        return boxes
+        assert self.image_detector is not None
+        return self.image_detector.image_boxes(self.image_detector(images.flatten(0, 1)), has_image, image_sizes)
 
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""

