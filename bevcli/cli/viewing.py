@@ -19,7 +19,7 @@ from bevcli.viewer.recording_file import (
     open_recording,
     recording_in as recording_in,
 )
-from bevcli.viewer.recording_reader import summarise
+from bevcli.viewer.recording_reader import RecordingReader, summarise
 from bevcli.viewer.web import WebViewer, web_viewer_assets
 
 
@@ -47,7 +47,10 @@ def record_drive(
     drive = open_with_bar(path, source, format_options)
     indices = [stamp.index for stamp in drive.stamps]
     if options.frame is not None and options.frame not in indices:
-        raise InputError(f"--frame {options.frame}: the drive has frames {min(indices)} to {max(indices)}")
+        raise InputError(
+            f"--frame {options.frame}: the drive has {counted(len(indices), 'frames')} from {min(indices)} to "
+            f"{max(indices)}, and not this one"
+        )
     with tempfile.TemporaryDirectory(prefix="bevcli-") as folder:
         file = options.out or Path(folder) / RECORDING
         with Progress(len(drive.stamps), "frames", drive.notes) as progress:
@@ -87,6 +90,7 @@ def _open_viewer(recording: Path, options: ViewOptions) -> None:
             return
         say("note: the viewer's window did not open; use the browser instead")
     if options.frame is not None:
+        RecordingReader(recording).check_frame(options.frame)
         say(f"note: in the browser, set the timeline to frame {options.frame}")
     viewer = WebViewer(web_viewer_assets(), recording, options.host, options.port)
     say(f"{viewer.address}  Open this address in a browser. Ctrl-C stops the server.")

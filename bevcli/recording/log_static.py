@@ -66,6 +66,7 @@ OF_A_MODEL = """\
 """
 LEGEND_COLUMNS = 2
 COLUMN_WIDTH, ROW_HEIGHT = 9.0, 1.0  # in the units of the view
+LETTER_WIDTH = 0.27  # of the same, in a window of 1920 pixels
 
 
 class RecordedModel(Protocol):
@@ -263,11 +264,11 @@ def log_about(stream: rr.RecordingStream, recorded: Recorded) -> None:
     rows = -(-len(legend) // LEGEND_COLUMNS)
     spots = np.array([(i // rows * COLUMN_WIDTH, (i % rows + 0.5) * ROW_HEIGHT) for i in range(len(legend))])
     texts, colors_of_entries = zip(*legend, strict=True)
-    circles = rr.Points2D(spots + (0.7, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
+    circles = rr.Points2D(spots + (0.5, 0), colors=colors_of_entries, radii=rr.Radius.ui_points(6.0))
     stream.log(f"{entities.LEGEND}/colors", circles, static=True)
-    labels = labels_2d(
-        spots + (5.0, -0.25), list(texts), colors=entities.TEXT_COLOR
-    )  # a label is drawn below its point
+    halves = np.array([len(text) * LETTER_WIDTH / 2 for text in texts])  # a label is centred below its point
+    places = spots + np.stack([1.05 + halves, np.full(len(texts), -0.25)], axis=-1)
+    labels = labels_2d(places, list(texts), colors=entities.TEXT_COLOR)
     log(stream, f"{entities.LEGEND}/texts", labels, static=True)
 
 

@@ -5,6 +5,7 @@ recording.rrd has the same for the rerun viewer, with the findings. The overlay 
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from bevcli.viewer.drawing import FONT, Canvas, draw_lines
 from bevcli.writing import whole_file
 
 GRID_STEP_M, GRID_REACH_M = 5.0, 30.0
+FINE_STEP_M, FINE_REACH_M = 1.0, 15.0  # of the grid in a large image, beside the other one
 PILLAR_LINES_M = 25.0  # lines of farther pillars would be too dense
 PILLAR_GRID = BevGrid(rows=20, columns=20)  # one pillar every 5.12 m; a denser grid would hide the image
 LABELLED_M = (5.0, 10.0, 20.0, 40.0)
@@ -61,11 +63,11 @@ def height_colors() -> NDArray[np.uint8]:
     return colormap(np.linspace(0.12, 0.9, PILLAR_GRID.pillar_points), "turbo")
 
 
-def ground_lines(camera: Camera) -> list[Array]:
-    """Lines (P, 2) in pixels of a 5 m grid on the ground around the ego origin, cut near the image border."""
-    along = np.arange(-GRID_REACH_M, GRID_REACH_M + 0.05, 0.1)
+def ground_lines(camera: Camera, step_m: float = GRID_STEP_M, reach_m: float = GRID_REACH_M) -> list[Array]:
+    """Lines (P, 2) in pixels of a grid on the ground around the ego origin, cut near the image border."""
+    along = np.arange(-reach_m, reach_m + 0.05, 0.1)
     lines: list[Array] = []
-    for offset in np.arange(-GRID_REACH_M, GRID_REACH_M + 0.1, GRID_STEP_M):
+    for offset in np.arange(-reach_m, reach_m + 0.1, step_m):
         across, flat = np.full_like(along, offset), np.zeros_like(along)
         for line in (np.stack([along, across, flat], axis=-1), np.stack([across, along, flat], axis=-1)):
             lines += visible_runs(_near_image(camera, line))
@@ -107,10 +109,12 @@ def visible_runs(pixels: Array) -> list[Array]:
     return [run for run in np.split(pixels, cuts) if len(run) > 1 and np.isfinite(run).all()]
 
 
-def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Canvas | None, width: int) -> Canvas:
+def draw_overlay(
+    camera: Camera, ego_from_bev: Array, image_bgr: Canvas | None, width: int, *, fine: bool = False
+) -> Canvas:
     """The camera's image with the overlay, (h, width, 3) RGB.
 
-    image_bgr: (H, W, 3); a dark image is used where it is None. width: of the result, pixels.
+    image_bgr: (H, W, 3); a dark image is used where it is None. width: of the result, pixels. fine: lines each metre.
     """
     shown = camera.scaled(width / camera.width)
     if image_bgr is None:
@@ -118,7 +122,9 @@ def draw_overlay(camera: Camera, ego_from_bev: Array, image_bgr: Canvas | None, 
     else:
         resized = cv2.resize(image_bgr, (shown.width, shown.height), interpolation=cv2.INTER_AREA)
         canvas = (resized[..., ::-1] * 0.85).astype(np.uint8)  # a little darker, so that the overlay stands out
-    draw_lines(canvas, ground_lines(shown), GROUND_GRID_COLOR, opacity=0.55, bits=4)
+    if fine:
+        draw_lines(canvas, ground_lines(shown, FINE_STEP_M, FINE_REACH_M), GROUND_GRID_COLOR, opacity=0.45, bits=4)
+    draw_lines(canvas, ground_lines(shown), GROUND_GRID_COLOR, 2 if fine else 1, opacity=0.55, bits=4)
     draw_lines(canvas, visible_runs(horizon(shown)), HORIZON_COLOR, 2, 0.9, 4)
     draw_lines(canvas, pillar_lines(shown, ego_from_bev), PILLAR_COLOR, opacity=0.35, bits=4)
     for pixel, distance, color in zip(*pillars_in(shown, ego_from_bev), strict=True):
@@ -150,7 +156,7 @@ DPI = 100
 SLOT, GAP, TITLE, DETAILS, MIDDLE = 5.2, 0.3, 0.32, 0.38, 5.2
 FOOTER = 3.0  # findings and legend, where cameras are placed beside the map
 LINE = 0.19  # height of a line of text
-IMAGE_WIDTH = 1040  # pixels
+IMAGE_WIDTH = 1040  # pixels, of an image as wide as SLOT
 PAPER, INK, FAINT = "#14171c", "#e8ecf1", "#8a93a0"
 COUNT_COLORS = ("#b3324a", "#2b4a63", "#3f8f8a", "#9fd67a", "#f4f1a1")  # of 0, 1, 2, 3, and 4 or more cameras
 LEGEND_STYLE = {"facecolor": PAPER, "edgecolor": "none", "labelcolor": INK, "fontsize": 9}
@@ -163,20 +169,22 @@ def write_camera_sheet(
     """Write the PNG. images: by camera, (H, W, 3) BGR; others are drawn on a dark background. Raises OutputError."""
     front, left, right, back = _cameras_by_side(rig)
     columns = max(len(front), len(back), 3)
-    ahead, behind = (max(map(_camera_height, row), default=0.0) for row in (front, back))
-    heights = [ahead, max(*(sum(map(_camera_height, column)) for column in (left, right)), MIDDLE), behind]
+    slot = SLOT if len(rig.cameras) > 1 else columns * (SLOT + GAP) - GAP  # one image has all of the width
+    height_of = partial(_camera_height, slot=slot)
+    ahead, behind = (max(map(height_of, row), default=0.0) for row in (front, back))
+    heights = [ahead, max(*(sum(map(height_of, column)) for column in (left, right)), MIDDLE), behind]
     footer = FOOTER if left or right else 0.0
-    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + footer + 2 * GAP)
+    sheet = _Sheet(columns * (SLOT + GAP) + GAP, sum(heights) + footer + 2 * GAP, slot)
     tops = GAP + np.cumsum([0.0, *heights[:2]])
     for row, top in ((front, tops[0]), (back, tops[2])):
-        start = (sheet.width - len(row) * (SLOT + GAP) + GAP) / 2
+        start = (sheet.width - len(row) * (slot + GAP) + GAP) / 2
         for column_index, camera in enumerate(row):
-            _draw_camera(sheet, (start + column_index * (SLOT + GAP), top), camera, rig, findings, images)
+            _draw_camera(sheet, (start + column_index * (slot + GAP), top), camera, rig, findings, images)
     for column, start in ((left, GAP), (right, sheet.width - SLOT - GAP)):
         top = tops[1]
         for camera in column:
             _draw_camera(sheet, (start, top), camera, rig, findings, images)
-            top += _camera_height(camera)
+            top += height_of(camera)
     size, top = MIDDLE - 1.1, tops[1] + (heights[1] - MIDDLE) / 2 + 0.35
     draw_coverage(sheet.axes((sheet.width - size) / 2 + 0.1, top, size, size), rig, coverage)
     if footer:
@@ -187,10 +195,10 @@ def write_camera_sheet(
 
 
 class _Sheet:
-    """A figure on which axes are placed in inches from the top left corner."""
+    """A figure on which axes are placed in inches from the top left corner. slot: width of an image."""
 
-    def __init__(self, width: float, height: float) -> None:
-        self.width, self.height = width, height
+    def __init__(self, width: float, height: float, slot: float) -> None:
+        self.width, self.height, self.slot = width, height, slot
         self.figure = Figure(figsize=(width, height), dpi=DPI, facecolor=PAPER)
 
     def axes(self, left: float, top: float, width: float, height: float) -> Axes:
@@ -199,14 +207,14 @@ class _Sheet:
         return self.figure.add_axes(box)
 
 
-def _camera_height(camera: Camera) -> float:
-    return TITLE + SLOT * min(camera.height / camera.width, 1.0) + DETAILS
+def _camera_height(camera: Camera, slot: float) -> float:
+    return TITLE + slot * min(camera.height / camera.width, 1.0) + DETAILS
 
 
 def _cameras_by_side(rig: CameraRig) -> tuple[list[Camera], list[Camera], list[Camera], list[Camera]]:
     """The cameras that look ahead (from left to right), left, right, and back (from the vehicle's left to right)."""
     yaws = {camera.name: float(np.degrees(camera.yaw)) for camera in rig.cameras}
-    low, high = SIDE_DEG
+    low, high = SIDE_DEG if len(yaws) > 1 else (360.0, 360.0)  # one camera is at the top, wherever it looks
     ahead = [c for c in rig.cameras if abs(yaws[c.name]) < low]
     back = [c for c in rig.cameras if abs(yaws[c.name]) > high]
     sides = [c for c in rig.cameras if low <= abs(yaws[c.name]) <= high]
@@ -228,11 +236,12 @@ def _draw_camera(
 ) -> None:
     """Draw a camera's image with title, angles and its first finding. corner: left and top, inches."""
     left, top = corner
-    axes = sheet.axes(left, top + TITLE, SLOT, _camera_height(camera) - TITLE - DETAILS)
+    axes = sheet.axes(left, top + TITLE, sheet.slot, _camera_height(camera, sheet.slot) - TITLE - DETAILS)
+    width = round(IMAGE_WIDTH * sheet.slot / SLOT)
     image = images.get(camera.name)
     if image is not None and image.shape[:2] != (camera.height, camera.width):
         image = cv2.resize(image, (camera.width, camera.height)).astype(np.uint8)
-    axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, IMAGE_WIDTH))
+    axes.imshow(draw_overlay(camera, rig.ego_from_bev, image, width, fine=sheet.slot > SLOT))
     axes.set(xticks=[], yticks=[])
     mounting = mounting_of(camera.ego_from_camera)
     mine = [finding for finding in findings if finding.camera == camera.name]
@@ -281,7 +290,10 @@ def _write_legend(axes: Axes) -> None:
             [], [], color=tuple(np.array(HORIZON_COLOR) / 255), label="horizon: infinitely far, at the camera's height"
         ),
         Line2D(
-            [], [], color=tuple(np.array(GROUND_GRID_COLOR) / 255), label="ground grid of 5 m: should lie on the road"
+            [],
+            [],
+            color=tuple(np.array(GROUND_GRID_COLOR) / 255),
+            label="ground grid of 5 m, fine 1 m: should lie on the road",
         ),
     ]
     axes.legend(handles=dots + lines, loc="upper left", bbox_to_anchor=(0.08, 0.94), labelspacing=0.9, **LEGEND_STYLE)

@@ -22,6 +22,7 @@ from rerun.experimental import ViewerClient  # the only client that takes screen
 from bevcli.errors import InputError, OutputError, WaitError
 from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
+from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.writing import write_whole
 
 LOOPBACK = "127.0.0.1"
@@ -155,11 +156,7 @@ def _go_to(recording: Path, client: ViewerClient, state: Any, frame: int | None)
     if timeline is None or timeline.start is None or timeline.end is None or timeline.time_type != "sequence":
         raise InputError(f"{recording}: the recording has no frames (expected one of `bevcli run`)")
     index = timeline.start if frame is None else frame
-    if not timeline.start <= index <= timeline.end:
-        raise InputError(
-            f"{recording}: `frame={index}` (`--frame {index}`): the recording has frames {timeline.start} to "
-            f"{timeline.end}"
-        )
+    RecordingReader(recording).check_frame(index)
     client.set_time(entities.FRAME_TIMELINE, sequence=index, play_state="paused")
 
 

@@ -1,6 +1,7 @@
 """Reads a recording frame by frame, with as few frames in memory as the file's order allows; boxes; the summary."""
 
 import warnings
+from bisect import bisect
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.printing import counted
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 
@@ -168,6 +170,18 @@ class RecordingReader:
                 state = _applied(state | {entity: static.get(entity, {}) for entity in OF_EACH_FRAME}, rows)
                 if {entity for _, entity, _ in rows}.issuperset(OF_EACH_FRAME):
                     yield RecordedFrame(frame, state, self.path)
+
+    def check_frame(self, index: int) -> None:
+        """Raise InputError, which names the nearest frames, if the recording does not have a frame."""
+        vehicle = (chunk for chunk in self.chunks() if chunk.entity_path.strip("/") == entities.EGO)
+        frames = sorted({frame for chunk in vehicle for frame in self._frames_of(chunk)})
+        if frames and index not in frames:
+            place = bisect(frames, index)
+            near = " and ".join(map(str, frames[max(place - 1, 0) : place + 1]))
+            raise InputError(
+                f"{self.path}: `frame={index}` (`--frame {index}`): the recording has {counted(len(frames), 'frames')} "
+                f"from {frames[0]} to {frames[-1]}, and not this one (nearest: {near})"
+            )
 
     def _frames_of(self, chunk: Chunk) -> list[int]:
         """The frame of each row; [] where the rows are of no frame. Raises InputError for times in place of frames."""

@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
-from memory_drive import make_camera, make_rig
+from memory_drive import MemoryDrive, make_camera, make_rig
+from recorded_drive import record
 
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, default_ego_from_bev
+from bevcli.recording import entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, camera_rows, rows_by_yaw
 from bevcli.recording.log_cameras import LETTER_HEIGHT, LETTER_WIDTH, ImageLines, labels_in_image
+from bevcli.viewer.recording_reader import RecordingReader
 
 
 def test_nuscenes_cameras_are_in_two_rows():
@@ -87,3 +90,15 @@ def test_labels_do_not_overlap_and_the_largest_box_wins():
     size = np.array([8 * LETTER_WIDTH * 800, LETTER_HEIGHT * 450])
     assert (np.abs(centers[0] - centers[1]) >= size - 1e-9).any()
     assert (centers - size / 2)[:, 0].min() >= -1e-9
+
+
+def test_the_labels_of_the_legend_begin_at_their_colours(tmp_path):
+    """Letters are at most 0.3 units wide."""
+    record(tmp_path / "r.rrd", MemoryDrive(1))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    colors, texts = (frame.array(f"{entities.LEGEND}/{kind}", "Points2D:positions", 2) for kind in ("colors", "texts"))
+    halves = np.array([len(text) for text in frame.texts(f"{entities.LEGEND}/texts", "Points2D:labels")]) * 0.15
+    starts = texts[:, 0] - halves - colors[:, 0]
+    assert len(starts) > 10
+    assert (starts > -0.1).all()
+    assert (starts < 1.0).all()

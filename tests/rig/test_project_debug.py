@@ -19,6 +19,19 @@ FAST_RIGS = ("four fisheyes",)  # other tests write the files of rigs with plain
 FILES = {"cameras.png", "coverage.png", "recording.rrd", "findings.json"}
 
 
+def test_one_camera_is_drawn_large_with_a_fine_grid(tmp_path):
+    """Six images are 520 pixels wide; one has the width of three of them."""
+    document = copy_of("six")
+    document["cameras"] = {"CAM_FRONT": document["cameras"]["CAM_FRONT"]}
+    check = check_calibration(calibration(document, tmp_path))
+    white = {"CAM_FRONT": np.full((900, 1600, 3), 255, np.uint8)}
+    drawings.write_camera_sheet(tmp_path / "one.png", check.rig, (), check.coverage, white)
+    sheet = cv2.imread(str(tmp_path / "one.png"))
+    assert ((sheet > 200).all(-1).mean(1) > 0.7).sum() > 300  # rows of pixels, most of them of the image
+    camera = check.rig.cameras[0]
+    assert len(drawings.ground_lines(camera, 1.0, 15.0)) > 1.5 * len(drawings.ground_lines(camera))
+
+
 def run(*arguments):
     return CliRunner().invoke(app, ["project-debug", *map(str, arguments)])
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
+from matplotlib.figure import Figure
 from painted_drives import CONFIG, PaintedDrives
 from safetensors.torch import load_file
 
@@ -33,7 +34,7 @@ from bevcli.workshop.training.trainer import (
     save_checkpoint,
     set_learning_rate,
 )
-from bevcli.workshop.training.validation import LearningCurve
+from bevcli.workshop.training.validation import LearningCurve, draw_learning_curves
 
 SHORT = TrainingConfig(
     steps=5, held_out=0, evaluate_every=4, checkpoint_every=2, clips=ClipConfig(frames=2, batch=2, short_share=0.0)
@@ -209,6 +210,24 @@ def test_a_training_leaves_only_weights_that_can_be_loaded(tmp_path: Path) -> No
 
 def test_a_training_draws_its_learning_curves(whole: Trainer) -> None:
     assert cv2.imread(str(whole.job.out / "curves.png")).std() > 10
+
+
+def test_validation_is_drawn_up_to_its_best_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+
+    def keep(figure: Figure, path: Path, **_: object) -> None:
+        path.touch()
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    loss, validation = (LearningCurve(tmp_path / f"{name}.csv") for name in ("loss", "validation"))
+    for step in range(3):
+        loss.add(step, {"boxes": 1.0 / (step + 1)})
+        validation.add(step, {"mAP": 0.01 * step})
+    draw_learning_curves(loss, validation, tmp_path / "curves.png")
+    low, high = drawn[0].axes[1].get_ylim()
+    assert low == 0
+    assert 0.02 < high < 0.03
 
 
 def test_a_kill_while_writing_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -159,3 +159,17 @@ def test_the_first_process_to_read_a_recording_has_one_gigabyte(recording):
         done = run_python(greedy, [recording], 1 << 30, seconds, environment)
     assert done.returncode == 1
     assert b"MemoryError" in done.stderr
+
+
+def test_a_frame_that_a_thinned_recording_lacks_is_an_error(tmp_path):
+    """The viewer shows the frame before in silence."""
+    drive = MemoryDrive(7)
+    with Recording(tmp_path / "r.rrd", drive, NamedModel(), RecordingOptions("minimal")) as recording:
+        for frame in map(drive.load, (0, 2, 6)):
+            recording.log(frame, predict(frame))
+    reader = RecordingReader(tmp_path / "r.rrd")
+    for index in (0, 2, 6):
+        reader.check_frame(index)
+    for index, near in ((1, "0 and 2"), (5, "2 and 6"), (7, "6"), (-1, "0")):
+        with pytest.raises(InputError, match=rf"`--frame {index}`.*3 frames from 0 to 6, .*\(nearest: {near}\)"):
+            reader.check_frame(index)

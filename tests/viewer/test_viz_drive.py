@@ -115,7 +115,7 @@ def test_a_temporary_recording_is_shown_at_the_frame(folder, opened, monkeypatch
         ("x.rrd --version v1.0-mini", r"x\.rrd: is a recording, and `version` \(`--version`\) is for a drive"),
         ("samples/street --boxes mine.json --boxes mine.json", "have the same name"),
         ("samples/street --boxes samples/street/ground_truth.json", 'boxes have no "score"'),
-        ("samples/street --frame 99", "--frame 99: the drive has frames 0 to 2"),
+        ("samples/street --frame 99", "--frame 99: the drive has 3 frames from 0 to 2, and not this one"),
         ("samples/street --out x.json", r"x\.json: the file must end in \.rrd"),
     ],
 )

@@ -167,11 +167,11 @@ class Validation(FrameScores):
     drives: tuple[DriveScores, ...] = ()
 
     def summary(self) -> dict[str, float]:
-        """mAP, NDS and mAVE (m/s) over the classes that have ground truth, and IoU by class; NaN if not measured."""
+        """mAP, NDS and mAVE (m/s) over the classes that have ground truth, NaN without any; IoU by class, of a map."""
         table = self.detection.overall.of_classes_with_ground_truth()
         iou = {} if self.segmentation is None else self.segmentation.iou
         detection = {"mAP": table.mean_ap, "NDS": table.nd_score, "mAVE": table.errors["vel_err"]}
-        return detection | {f"IoU {name}": iou.get(name, math.nan) for name in MAP_CLASSES}
+        return detection | {f"IoU {name}": iou[name] for name in MAP_CLASSES if name in iou}
 
     def row(self) -> dict[str, float]:
         """The columns of validation.csv: the summary, mATE (metres), and AP by class, 0 without ground truth."""
@@ -314,7 +314,7 @@ class LearningCurve:
 
     def add(self, step: int, numbers: Row) -> None:
         """Appends a row and writes it to the files at once, finite numbers only for TensorBoard."""
-        row = {"step": step, **numbers}
+        row = dict.fromkeys(self.rows[0] if self.rows else (), math.nan) | {"step": step, **numbers}
         _write_rows(self.path, [row], "a", header=not self.rows)
         self.rows.append(row)
         if self._events is not None:
@@ -331,7 +331,8 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
     _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
     left.set(title="Training loss", xlabel="step", yscale="log")
-    right.set(title="Validation", xlabel="step", ylim=(0, 1))
+    right.set(title="Validation", xlabel="step")
+    right.set_ylim(bottom=0)
     with whole_file(path) as unfinished:
         figure.savefig(unfinished, dpi=110)
 
@@ -342,7 +343,7 @@ def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str
         if name not in skipped and not all(map(math.isnan, values)):
             axes.plot([row["step"] for row in rows], values, label=name, marker=marker)
     if rows:
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves
     axes.grid(alpha=0.3)
 
 
