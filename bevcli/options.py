@@ -13,17 +13,21 @@ A text of the library names an option as both spell it: "pass `rate_hz` (`--rate
 """
 
 import dataclasses
+import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING
 from pathlib import Path
-from typing import Any, Literal, TypeVar, dataclass_transform, get_type_hints
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
-from bevcli.printing import did_you_mean
+from bevcli.errors import InputError
+from bevcli.printing import did_you_mean, one_line
 
 Reads = Literal["path", "path or name", "path or pattern"]
 _Class = TypeVar("_Class", bound=type[Any])
 _Options = TypeVar("_Options")
+_TEXTS = {str, Path, Any, Sequence, Iterable}  # types of options that take any text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +50,7 @@ class Option:
             a missing one before anything slow is imported.
         hidden: whether only Python has the option.
         is_argument: whether it is an argument of the command and no flag.
+        mistaken: end of the error about a text that means nothing: the option that it may be for.
     """
 
     help: str
@@ -61,6 +66,7 @@ class Option:
     reads: Reads | None = None
     hidden: bool = False
     is_argument: bool = False
+    mistaken: str = ""
 
     def spellings(self, name: str) -> list[str]:
         """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too. name: the field."""
@@ -77,9 +83,20 @@ def option(
 
 @dataclass_transform(frozen_default=True, field_specifiers=(option, dataclasses.field))
 def options(panel: str = "Options") -> Callable[[_Class], _Class]:
-    """Make a class a frozen dataclass of options. panel: heading of its options in `--help`."""
+    """Make a class a frozen dataclass of options, which refuses values that mean nothing by an InputError.
+
+    panel: heading of its options in `--help`.
+    """
 
     def decorate(cls: _Class) -> _Class:
+        own_check = getattr(cls, "__post_init__", None)
+
+        def check(self: Any) -> None:
+            _check_values(self)
+            if own_check is not None:
+                own_check(self)
+
+        cls.__post_init__ = check
         made: Any = dataclasses.dataclass(frozen=True)(cls)
         made.panel = panel
         options = ((field.name, field.metadata.get("option")) for field in dataclasses.fields(made))
@@ -88,6 +105,40 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
         return made
 
     return decorate
+
+
+def _check_values(made: Any) -> None:
+    """Raise InputError for a text where the option's type has no such text, and for a number outside its range."""
+    for field in dataclasses.fields(made):
+        value, option = getattr(made, field.name), field.metadata.get("option")
+        if option is None or value is None:
+            continue
+        if isinstance(value, str):
+            kinds = _kinds(type(made), field.name)  # type: ignore[arg-type]
+            texts = [text for kind in kinds if get_origin(kind) is Literal for text in get_args(kind)]
+            if value not in texts and not _TEXTS.intersection(kinds):
+                others = [kind.__name__ for kind in kinds if isinstance(kind, type) and kind is not type(None)]
+                wrong = f"means nothing (expected {', '.join([*texts, *others])}{option.mistaken})"
+                raise InputError(f"{_with_value(made, field.name)}: {wrong}")
+        elif isinstance(value, int | float):
+            low, high = option.minimum, option.maximum
+            if (low is not None and not value >= low) or (high is not None and not value <= high):
+                ends = ((low, "more"), (high, "less"))
+                limits = ", ".join(f"{limit:g} or {word}" for limit, word in ends if limit is not None)
+                raise InputError(f"{_with_value(made, field.name)}: expected {limits}")
+
+
+def _with_value(made: Any, name: str) -> str:
+    """An option and its value in a text: "`every=0` (`--every`)"."""
+    return named(type(made), name).replace(f"`{name}`", f"`{name}={one_line(getattr(made, name), 60)}`", 1)
+
+
+@functools.cache
+def _kinds(cls: type[Any], name: str) -> tuple[Any, ...]:
+    """The types of an option: those of a union, or the one."""
+    hint = get_type_hints(cls)[name]
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return tuple(get_origin(kind) or kind if get_origin(kind) is not Literal else kind for kind in kinds)
 
 
 def named(cls: type[Any], name: str) -> str:
@@ -153,5 +204,7 @@ def parse_pairs(texts: Iterable[str], expected: str) -> dict[str, str]:
         name, equals, value = text.partition("=")
         if not (name and equals and value):
             raise ValueError(f'"{text}" (expected {expected})')
+        if name in pairs:
+            raise ValueError(f'"{text}" (expected {name} once)')
         pairs[name] = value
     return pairs

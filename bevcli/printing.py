@@ -8,7 +8,7 @@ import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
-LONGEST_MESSAGE = 1000  # characters
+LONGEST_MESSAGE, LONGEST_LIST, LONGEST_NAME = 1000, 300, 60  # characters
 
 
 def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
@@ -20,6 +20,11 @@ def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
         return text
     end = longest // 3  # a message ends with what to do
     return f"{text[: longest - end - 3]}...{text[len(text) - end :]}"
+
+
+def shortened(names: Iterable[object], longest: int = LONGEST_LIST) -> str:
+    """Names of a file as a list for a message, shortened."""
+    return one_line(", ".join(one_line(name, LONGEST_NAME) for name in names), longest)
 
 
 def valid_text(name: str) -> str:

@@ -14,6 +14,7 @@ from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
 TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
 ROAD_S = 5.0  # the mean of the vehicle's upward axis over this time before and after is taken for the road's
+BLOCK, AROUND = 65_536, 2  # rows whose motion is derived at once, and rows around them: of a difference of differences
 LONGEST_S = 0.5  # that a pose counts for in that mean
 
 
@@ -116,10 +117,11 @@ class EgoMotion:
     @cached_property
     def _road_normals(self) -> Array:
         """(T, 3) in the world frame."""
-        rotations = np.stack([rotation_from_quaternion(q) for q in self.quaternions])
         if self.road_normals is not None:
-            return np.einsum("tij,tj->ti", rotations, self.road_normals)
-        seconds, upward = (self.timestamps_ns - self.first_ns) / 1e9, rotations[:, :, 2]
+            return np.einsum("tij,tj->ti", rotation_from_quaternion(self.quaternions), self.road_normals)
+        blocks = range(0, len(self.timestamps_ns), BLOCK)  # all rotations of a long drive at once would fill the memory
+        parts = [rotation_from_quaternion(self.quaternions[row : row + BLOCK])[:, :, 2] for row in blocks]
+        seconds, upward = (self.timestamps_ns - self.first_ns) / 1e9, np.concatenate(parts)
         weights = np.minimum(np.gradient(seconds), LONGEST_S) if len(seconds) > 1 else np.ones(1)
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(weights[:, None] * upward, axis=0)])
         begin, end = np.searchsorted(seconds, seconds - ROAD_S), np.searchsorted(seconds, seconds + ROAD_S, "right")
@@ -175,12 +177,24 @@ def derive_kinematics(
 
     timestamps_ns: (T,). translations: (T, 3) metres, world frame. quaternions: (T, 4) w, x, y, z.
     """
-    count = len(timestamps_ns)
-    rotations = np.stack([rotation_from_quaternion(q) for q in quaternions])
+    count, seconds = len(timestamps_ns), (timestamps_ns - timestamps_ns[0]) / 1e9
+    if count <= BLOCK:
+        return _kinematics(seconds, translations, quaternions)
+    blocks = []
+    for row in range(0, count, BLOCK):  # with the rows before and after that the differences take
+        rows = slice(max(row - AROUND, 0), row + BLOCK + AROUND)
+        kept = slice(row - rows.start, row - rows.start + BLOCK)
+        made = _kinematics(seconds[rows], translations[rows], quaternions[rows])
+        blocks.append([column[kept] for column in made])
+    accelerations, rates, velocities = map(np.concatenate, zip(*blocks, strict=True))
+    return accelerations, rates, velocities
+
+
+def _kinematics(seconds: Array, translations: Array, quaternions: Array) -> tuple[Array, Array, Array]:
+    count, rotations = len(seconds), rotation_from_quaternion(quaternions)
     gravity = np.array([0.0, 0.0, GRAVITY])
     if count < 2:
         return np.einsum("tji,j->ti", rotations, gravity), np.zeros((count, 3)), np.zeros((count, 3))
-    seconds = (timestamps_ns - timestamps_ns[0]) / 1e9
     velocity = np.gradient(translations, seconds, axis=0)
     acceleration = np.gradient(velocity, seconds, axis=0) + gravity
     derivative = np.gradient(rotations, seconds, axis=0)

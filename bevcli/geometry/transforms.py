@@ -76,31 +76,36 @@ def apply(a_from_b: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
-    """(3, 3) rotation of a quaternion (w, x, y, z), which is normalised first."""
+    """(3, 3) rotation of a quaternion (w, x, y, z), which is normalised first; (T, 3, 3) of (T, 4)."""
     q = np.asarray(quaternion, dtype=np.float64)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
+    w, x, y, z = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
+    rows = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+    return np.ascontiguousarray(rows.T.swapaxes(-1, -2))  # (T, 3, 3)
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
-    """(4,) w, x, y, z with w >= 0 of a rotation (3, 3), by Bar-Itzhack's method (the largest eigenvector)."""
-    r = np.asarray(rotation, dtype=np.float64)
+    """(4,) w, x, y, z with w >= 0 of a rotation (3, 3); (T, 4) of (T, 3, 3).
+
+    By Bar-Itzhack's method, the largest eigenvector.
+    """
+    r = np.asarray(rotation, dtype=np.float64).swapaxes(-1, -2).T  # (3, 3, T)
+    zero = np.zeros_like(r[0, 0])
     k = np.array(
         [
-            [r[0, 0] + r[1, 1] + r[2, 2], 0, 0, 0],
-            [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], 0, 0],
-            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0],
+            [r[0, 0] + r[1, 1] + r[2, 2], zero, zero, zero],
+            [r[2, 1] - r[1, 2], r[0, 0] - r[1, 1] - r[2, 2], zero, zero],
+            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], zero],
             [r[1, 0] - r[0, 1], r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1]],
         ]
     )
-    vector = np.linalg.eigh(k)[1][:, -1]  # eigh reads the lower triangle
-    return -vector if vector[0] < 0 else vector
+    vectors = np.linalg.eigh(k.T.swapaxes(-1, -2))[1][..., -1]  # eigh reads the lower triangle
+    return np.where(vectors[..., :1] < 0, -vectors, vectors)
 
 
 def rotation_about_z(yaw: float) -> Array:

@@ -10,7 +10,8 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -18,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.printing import reason_of
+from bevcli.parsing.files import MIB, read_bytes
+from bevcli.printing import reason_of, shortened
 
 DEEPEST = 64  # levels of nested lists and objects
 LARGEST_INTEGER = 2**62  # the difference of two such integers still fits 64 bits
@@ -43,7 +45,6 @@ def read_json(
     *,
     largest: int = JSON_BYTES,
     missing: str = "the file is missing",
-    pairs: Callable[[list[tuple[str, Any]]], Any] | None = None,
 ) -> Any:
     """The contents of a JSON file. Raises InputError.
 
@@ -51,13 +52,19 @@ def read_json(
         path: the file.
         largest: its largest size in bytes.
         missing: text of the message for a file that is not there.
-        pairs: makes an object of its keys and values, in place of a dict.
     """
-    return parse_json(read_bytes(path, largest, missing=missing), path, pairs=pairs)
+    return parse_json(read_bytes(path, largest, missing=missing), path)
 
 
-def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
-    """Parses JSON: at most 64 nested levels, integers of at most 62 bits. Raises InputError, which names `path`."""
+def parse_json(
+    text: bytes, path: Path, *, made: Callable[[dict[str, Any]], Any] | None = None, keys_checked: bool = True
+) -> Any:
+    """Parses JSON: at most 64 nested levels, integers of at most 62 bits, no key twice in an object.
+
+    made: makes an object of its keys and values, in place of a dict. keys_checked: False for a large file of a program,
+    which takes half as long again with it.
+    Raises InputError, which names `path`.
+    """
     without_strings = _STRING.sub(b"", text) if _depth(text) > DEEPEST else b""
     if _depth(without_strings) > DEEPEST:
         raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels of lists and objects)")
@@ -67,10 +74,19 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
             raise InputError(f"{path}: the integer {digits:.24} is too large (expected at most 62 bits)")
         return int(digits)
 
+    def members(pairs: list[tuple[str, Any]]) -> Any:
+        members = dict(pairs)
+        if len(members) < len(pairs):
+            keys = [key for key, _ in pairs]
+            twice = keys[first_twice(keys) or 0]
+            raise InputError(f'{path}: "{twice:.60}" appears twice in the same object: remove or rename one')
+        return members if made is None else made(members)
+
     # A Python function for integers makes parsing slow, and only a long row of digits needs it.
     long_number = b"0" * 19 in text.translate(_DIGITS_TO_ZERO)
     try:
-        document = json.loads(text, object_pairs_hook=pairs, parse_int=integer if long_number else None)
+        hook = members if keys_checked else None
+        document = json.loads(text, object_pairs_hook=hook, parse_int=integer if long_number else None)
         if b"\\u" in text:  # an escape may be half of a character, which no file or terminal takes
             json.dumps(document, ensure_ascii=False, default=vars).encode()
         return document
@@ -81,6 +97,13 @@ def parse_json(text: bytes, path: Path, *, pairs: Callable[[list[tuple[str, Any]
         raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
     except RecursionError:
         raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
+
+
+def first_twice(keys: Sequence[Hashable]) -> int | None:
+    """The index of the first key that stands earlier in the sequence too; None where each is there once."""
+    if len(set(keys)) == len(keys):
+        return None
+    return next(index for index, key in enumerate(keys) if key in keys[:index])
 
 
 def parse_toml(text: str, path: str | Path, error: type[BevcliError] = InputError) -> dict[str, Any]:
@@ -202,41 +225,91 @@ def _advice(text: str, column: str) -> str:
 
 
 def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> tuple[CsvRow, ...]:
-    """The rows of a CSV file with a header (UTF-8, separated by commas), at least one.
+    """All rows of a CSV file, see `csv_rows`."""
+    return tuple(csv_rows(path, required, optional))
+
+
+def csv_rows(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> Iterator[CsvRow]:
+    """The rows of a CSV file with a header (UTF-8, separated by commas), at least one, while it is parsed.
 
     Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
     has another number of cells than the header, or there are no rows.
     """
-    text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
+    content = read_bytes(path, CSV_BYTES)
+    reader = csv.reader(io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline=""))
+    lines = (cells for cells in reader if cells)
     try:
-        reader = csv.reader(io.StringIO(text, newline=""))
-        lines = [(reader.line_num, cells) for cells in reader if cells]
+        header = next(lines, None)
+        if header is None:
+            raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
+        columns, is_empty = _columns(path, header, required, optional), True
+        for cells in lines:
+            if any("\0" in cell for cell in cells):
+                raise InputError(
+                    f"{path}: line {reader.line_num}: has a null byte (expected text; the file may be damaged)"
+                )
+            if len(cells) != len(columns):
+                found = f"has {len(cells)} cells (expected {len(columns)}, as in the header)"
+                raise InputError(f"{path}: line {reader.line_num} {found}")
+            yield CsvRow(
+                path,
+                reader.line_num,
+                {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)},
+            )
+            is_empty = False
     except csv.Error as error:
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
-    if not lines:
-        raise InputError(f"{path}: the file is empty (expected a header with {', '.join(required)})")
-    columns = [name_of(cell.strip()) for cell in lines[0][1]]
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as text ({error})") from None
+    if is_empty:
+        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
+
+
+def parse_numbers_at_once(
+    lines: Iterable[str],
+    types: np.dtype[Any],
+    separator: str | None,
+    *,
+    places: Sequence[int] | None = None,
+    skipped: int = 0,
+) -> NDArray[Any] | None:
+    """(T,) rows of numbers with named columns; None where a cell is no number as `CsvRow` takes it.
+
+    types: of the columns, integers or floats. separator: None for spaces. places: of the columns; None for all that
+    the lines have. skipped: lines above the rows.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # an integer with a point
+            table = np.loadtxt(
+                lines,
+                types,
+                delimiter=separator,
+                usecols=places,
+                skiprows=skipped,
+                comments=None,
+                ndmin=1,
+                encoding=None,
+            )
+    except (ValueError, OverflowError, Warning):
+        return None
+    floats = [name for name in types.names or () if types[name].kind == "f"]
+    return table if all((np.abs(table[name]) < LARGEST_NUMBER).all() for name in floats) else None
+
+
+def _columns(path: Path, header: list[str], required: tuple[str, ...], optional: tuple[str, ...]) -> list[str]:
+    """The names of the columns. Raises InputError."""
+    columns = [name_of(cell.strip()) for cell in header]
     missing = [name for name in required if name not in columns]
     if missing and len(columns) == 1:
         for character, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if character in columns[0]:
                 raise InputError(f"{path}: the columns are separated by {name} (expected commas): save it with commas")
     if missing:
-        raise InputError(f'{path}: column "{missing[0]}" is missing (found: {", ".join(columns)})')
+        raise InputError(f'{path}: column "{missing[0]}" is missing (found: {shortened(columns)})')
     for name in columns:
         if name not in required and name not in optional:
-            raise InputError(f'{path}: unknown column "{name}" (known: {", ".join((*required, *optional))})')
+            raise InputError(f'{path}: unknown column "{name:.60}" (known: {", ".join((*required, *optional))})')
         if columns.count(name) > 1:
             raise InputError(f'{path}: column "{name}" appears twice in the header')
-    rows: list[CsvRow] = []
-    for line, cells in lines[1:]:
-        if any("\0" in cell for cell in cells):
-            raise InputError(f"{path}: line {line}: has a null byte (expected text; the file may be damaged)")
-        if len(cells) != len(columns):
-            raise InputError(f"{path}: line {line} has {len(cells)} cells (expected {len(columns)}, as in the header)")
-        rows.append(
-            CsvRow(path, line, {name: name_of(cell.strip()) for name, cell in zip(columns, cells, strict=True)})
-        )
-    if not rows:
-        raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
-    return tuple(rows)
+    return columns

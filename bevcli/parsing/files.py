@@ -37,6 +37,11 @@ def is_there(path: Path) -> bool:
     return os.path.lexists(path)
 
 
+def is_file_name(name: str) -> bool:
+    """True for a name from outside, of a camera, a scene or a server, that may become that of a file or folder."""
+    return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
+
+
 def read_bytes(
     path: Path, largest: int, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
 ) -> bytes:

@@ -11,7 +11,6 @@ from bevcli.options import option, options
 
 Images = Literal["jpeg", "av1"]
 Level = Literal["minimal", "standard", "full"]
-LEVELS: tuple[Level, ...] = ("minimal", "standard", "full")
 
 
 def parse_position(text: str) -> tuple[float, float]:
@@ -78,12 +77,8 @@ class RecordingOptions:
     )
 
     def __post_init__(self) -> None:
-        if self.level not in LEVELS:
-            raise InputError(f'`level` (`--record`): unknown level "{self.level}" (expected {", ".join(LEVELS)})')
         if not re.fullmatch(r"norm|pca|none|channel:\d+", self.bev):
             raise InputError(f'`bev` (`--bev`): unknown image "{self.bev}" (expected norm, pca, channel:K or none)')
-        if self.images not in ("jpeg", "av1"):
-            raise InputError(f'`images` (`--images`): unknown format "{self.images}" (expected jpeg or av1)')
         if self.images == "av1":
             require_av('`images="av1"` (`--images av1`)')
         if self.vehicle_mesh is not None and not self.vehicle_mesh.is_file():

@@ -118,7 +118,7 @@ class _Drive:
     @classmethod
     def of(cls, ego_motion: EgoMotion) -> "_Drive":
         """The poses of ego-motion."""
-        rotations = np.stack([rotation_from_quaternion(quaternion) for quaternion in ego_motion.quaternions])
+        rotations = rotation_from_quaternion(ego_motion.quaternions)
         steps, seconds = np.diff(ego_motion.translations, axis=0), np.diff(ego_motion.timestamps_ns) / 1e9
         distances = np.linalg.norm(steps, axis=1)
         speeds = distances / seconds

@@ -68,6 +68,8 @@ def open_steps(
     check_options(changes, [opened], f"{path}: is {opened.name}")
     made = gather(opened, None, {name: value for name, value in changes.items() if name in defaults(opened)})
     drive = made.open(path, options)
+    if not drive.rig.cameras:
+        raise InputError(f"{path}: {drive.name}: the rig has no camera (expected one or more)")
     check_time_unit(drive, path)
     if options.ground_truth:
         names = ClassNames(options.class_map, options.classes or NUSCENES_CLASSES)

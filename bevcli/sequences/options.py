@@ -87,6 +87,7 @@ class InputOptions(ClassOptions):
         help="The vehicle stands still; ego_motion.csv is not needed.",
         flag="--static",
         flag_value="static",
+        mistaken="; a file of poses is `ego_motion_file` (`--ego-motion FILE`)",
     )
     odometry: bool = option(
         default=False,
@@ -115,8 +116,6 @@ class InputOptions(ClassOptions):
             raise InputError("`rate_hz` (`--rate`) and `every` (`--every`) exclude each other: pass one of them")
         if isinstance(self.rate_hz, (int, float)) and not 0 < self.rate_hz < float("inf"):
             raise InputError(f"`rate_hz={self.rate_hz:g}` (`--rate`): expected frames per second, above 0")
-        if self.every is not None and self.every < 1:
-            raise InputError(f"`every={self.every}` (`--every`): expected an integer, 1 or more")
         if self.odometry and self.ego_motion == "static":
             raise InputError(
                 '`odometry` (`--odometry`) and `ego_motion="static"` (`--static`) exclude each other: pass one of them'

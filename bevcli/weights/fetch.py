@@ -38,6 +38,7 @@ PAUSE_S = 1.0  # after the first failed attempt; longer after the next ones
 MOST_BYTES = 4 << 30  # of a file whose size is not in the table of sources
 SPARE_BYTES = 64 << 20  # that stay free on the disk
 BLOCK = 1 << 20  # bytes
+LENGTH_DIGITS = 16  # of a file's length that are read
 LONGEST_TAG = 256
 NOT_RESUMED = (400, 412, 416, 431)  # statuses of a server that does not go on, but may send all
 CONTENT_RANGE = re.compile(r"bytes (\d{1,15})-(\d{1,15})/(\d{1,15})")
@@ -290,7 +291,7 @@ class Download:
         elif answer.status == 200:
             self._start_anew()
             self._most = self.expected_bytes or MOST_BYTES
-            self.total = int(length) if length.isdecimal() and len(length) < 16 else None
+            self.total = int(length[:LENGTH_DIGITS]) if length.isdecimal() else None  # a longer one is too large anyway
             self._limit(self.total or 0)
             _require_space(self._notes.parent, self.total or 0)
             if self.total and tag.isprintable() and tag.startswith('"') and len(tag) <= LONGEST_TAG:  # W/…: a weak one

@@ -8,11 +8,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 class Hub(BaseHTTPRequestHandler):
-    """`commits`: commit -> file -> content, of the repository team/model, whose branch main is the last commit."""
+    """`commits`: commit -> file -> content, of the repository team/model, whose branch main is the last commit.
+
+    `lies`: headers that take the place of the true ones.
+    """
 
     protocol_version = "HTTP/1.1"
     commits: dict[str, dict[str, bytes]]
     asked: list[str]
+    lies: dict[str, str]
 
     def do_HEAD(self) -> None:
         self.answer(with_body=False)
@@ -51,8 +55,7 @@ class Hub(BaseHTTPRequestHandler):
     def send(self, content: bytes, status: int = 200, *, with_body: bool, **headers: str) -> None:
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
-        self.send_header("ETag", f'"{digest(content)}"')
-        for name, value in headers.items():
+        for name, value in ({"ETag": f'"{digest(content)}"'} | headers | self.lies).items():
             self.send_header(name, value)
         self.end_headers()
         if with_body:
@@ -69,7 +72,7 @@ def digest(content: bytes) -> str:
 @contextmanager
 def serving() -> Iterator[tuple[str, type[Hub]]]:
     """A server: its address, and its handler, which has the commits and knows what was asked."""
-    handler = type("Handler", (Hub,), {"commits": {}, "asked": []})
+    handler = type("Handler", (Hub,), {"commits": {}, "asked": [], "lies": {}})
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -155,6 +156,40 @@ def test_what_is_no_model_is_one_line(hub, versions, tmp_path, name, said):
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
     assert said in done.stderr
+
+
+@pytest.mark.parametrize("header", ["ETag", "X-Linked-Etag", "X-Repo-Commit", "X-Xet-Hash"])
+@pytest.mark.parametrize(
+    "name", ['"../../../../escaped"', 'W/"../escaped"', '"{0}/escaped"', '".."', '"x\\y"', '"a b/"']
+)
+def test_a_server_names_no_file_outside_the_cache(hub, tmp_path, header, name):
+    hub.lies[header] = name.format(tmp_path)
+    with pytest.raises(WeightsError, match=f"hf:team/model: cannot be downloaded .*{header}.* is no name of a file"):
+        load_model("hf:team/model")
+    assert not list(tmp_path.rglob("*"))
+    hub.commits[FIRST] = {}  # a missing file is noted under the commit
+    with pytest.raises(WeightsError):
+        load_model("hf:team/model")
+    assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    "name", ["a/b.git", "a--b/c", "a/..", "-a/b", "a/b-", "a/" + "b" * 97, "a/b@../../x", "a/b@..", "a/b@x//y", "./no"]
+)
+def test_a_name_that_the_hub_refuses_is_one_line(hub, tmp_path, name):
+    with pytest.raises(WeightsError, match=r"is no model|no name of a model|is missing") as told:
+        load_model(f"hf:{name}")
+    assert "\n" not in str(told.value)
+    assert hub.asked == []
+    assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize("damage", [b"", b"\xff", b"../../..", b"x" * 5000])
+def test_a_damaged_cache_is_an_error_or_fetched_anew(hub, versions, tmp_path, damage):
+    load_model("hf:team/model")
+    (tmp_path / "cache/models--team--model/refs/main").write_bytes(damage)
+    with suppress(WeightsError):
+        assert same_weights(load_model("hf:team/model"), versions[0]["model.safetensors"])
 
 
 def test_a_server_that_is_gone_is_one_line(hub, monkeypatch):

@@ -2,13 +2,14 @@
 
 import os
 import time
+import tracemalloc
 
 import pytest
 
 from bevcli.errors import ConfigError, InputError
 from bevcli.parsing.documents import parse_json, parse_toml, read_csv, read_json
 from bevcli.parsing.files import read_bytes
-from bevcli.workshop.formats.markup import read_yaml
+from bevcli.workshop.formats.markup import parse_xml, read_yaml
 
 
 def refused(function, *arguments, error=InputError, **options):
@@ -83,6 +84,64 @@ def test_an_alias_of_a_plain_list_is_read(tmp_path):
     path = tmp_path / "file.yaml"
     path.write_text("a: &x [1, 2]\nb: *x\n")
     assert read_yaml(path) == {"a": [1, 2], "b": [1, 2]}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "".join(
+            f"a{n}: &a{n} {{<<: [{', '.join([f'*a{n - 1}'] * 10)}]}}\n" if n else "a0: &a0 {x: 1}\n" for n in range(10)
+        ),
+        f"a: &a {{{', '.join(f'k{n}: 1' for n in range(500))}}}\nb: {{<<: [{', '.join(['*a'] * 1500)}]}}",
+    ],
+    ids=["deep", "wide"],
+)
+def test_a_bomb_of_merges_ends_while_it_is_parsed(tmp_path, text):
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
+    tracemalloc.start()
+    try:
+        assert "more than 200000 values, merges written out" in refused(read_yaml, path)
+        assert tracemalloc.get_traced_memory()[1] < 100 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "key"),
+    [
+        ("a: 1\nb: 2\na: 3", 3, "a"),
+        ("x:\n  - {c: 1,\n     d: {e: 1, e: 2}}", 3, "e"),
+        ("a: {1: x, 0x1: y}", 1, "0x1"),
+        ("a: &a {x: 1}\nb: {<<: *a, y: 1, y: 2}", 2, "y"),
+        ("a: !!opencv-matrix\n  rows: 1\n  rows: 2", 3, "rows"),
+    ],
+)
+def test_a_key_twice_in_yaml_is_named(tmp_path, text, line, key):
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
+    assert f'line {line}: "{key}" appears twice in the same mapping' in refused(read_yaml, path)
+
+
+def test_a_merge_may_be_overridden_and_an_exponent_makes_a_number(tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 1e-05}\nc: [1E5, -2.e3, .5e-1, 1e5x, e5, 1.5, 0x1e5, 2e+3]\n")
+    numbers = [1e5, -2e3, 0.05, "1e5x", "e5", 1.5, 0x1E5, 2e3]
+    assert read_yaml(path) == {"a": {"x": 1, "y": 2}, "b": {"x": 1e-05, "y": 2}, "c": numbers}
+
+
+@pytest.mark.parametrize("text", [b'{"a": 1, "b": 2, "a": 3}', b'[{"x": {"a": 1, "a": 1}}]'])
+def test_a_key_twice_in_json_is_named(text):
+    assert '"a" appears twice in the same object' in refused(parse_json, text, "file")
+
+
+@pytest.mark.parametrize("levels", [64, 65, 100_000])
+def test_deep_xml_is_refused(levels):
+    text = b"<a>" * levels + b"</a>" * levels
+    if levels > 64:
+        assert "nested too deeply" in refused(parse_xml, text, "file")
+    else:
+        assert len(list(parse_xml(text, "file").iter())) == 64
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 50_000, "a = 2001-99-99", "a" + ".a" * 5000 + " = 1", "a = \x00"])

@@ -286,6 +286,69 @@ def test_kitti(tmp_path, kind):
     np.testing.assert_allclose(camera.ego_from_camera[:3, 2], [1, 0, 0], atol=1e-9)
 
 
+MIRRORS = [np.diag([-1.0, 1, 1]), np.diag([1.0, -1, 1]), np.diag([-1.0, -1, -1])]
+
+
+@pytest.mark.parametrize("mirror", MIRRORS, ids=["x", "y", "all"])
+@pytest.mark.parametrize("kind", ["T_ego_cam", "T_cam_ego", "T", "R and t", "chain", "nerfstudio", "KITTI", "own"])
+def test_a_matrix_that_mirrors_is_no_rotation(tmp_path, kind, mirror):
+    name, mirrored = NAMES[0], np.eye(4)
+    matrix = pose(name)
+    mirrored[:3, :3] = mirror
+    if kind.startswith("T"):
+        stated = np.linalg.inv(matrix) if kind == "T_cam_ego" else matrix
+        path = written(tmp_path, {"front": entry(name, **{kind: (stated @ mirrored).tolist()})})
+    elif kind == "R and t":
+        extrinsics = {"translation": matrix[:3, 3].tolist(), "rotation": (matrix[:3, :3] @ mirror).tolist()}
+        path = written(tmp_path, {"front": entry(name, extrinsics=extrinsics)})
+    elif kind == "chain":
+        chain = {"cam0": entry(name, T_ego_cam=matrix.tolist()), "cam1": entry(name, T_cn_cnm1=mirrored.tolist())}
+        path = written(tmp_path, chain)
+    elif kind == "nerfstudio":
+        frame = {"file_path": "images/a/0.jpg", "transform_matrix": (pose(name, axes=OPENGL) @ mirrored).tolist()}
+        numbers = dict(zip(("fl_x", "fl_y", "cx", "cy"), four(name), strict=True))
+        path = written(tmp_path, {"w": SIZE[0], "h": SIZE[1], **numbers, "frames": [frame]}, "transforms.json")
+    elif kind == "KITTI":
+        camera_from_velodyne = np.c_[mirror @ [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]], [0, -0.08, -0.27]]
+        rows = {"P_rect_02": np.c_[k_of(name), [0, 0, 0]], "S_rect_02": SIZE, "Tr_velo_to_cam": camera_from_velodyne}
+        path = written(tmp_path, lines_of(rows), "calib_cam_to_cam.txt")
+    else:
+        rotation = {"translation": matrix[:3, 3].tolist(), "rotation": (matrix[:3, :3] @ mirror).tolist()}
+        camera = {**FACTS[name], "ego_from_camera": rotation}
+        path = written(tmp_path, {"format": "bevcli-calibration/1", "cameras": {name: camera}}, "calibration.json")
+    with pytest.raises(InputError, match=r"mirror|left-handed|not upright|determinant") as told:
+        read(path, None)
+    assert "\n" not in str(told.value)
+
+
+def test_a_name_twice_is_named_in_every_calibration(tmp_path):
+    one = "<K>1 2</K>"
+    for file, text, twice in (
+        ("rig.xml", f"<opencv_storage>{one}{one}</opencv_storage>", '"K" appears twice in <opencv_storage>'),
+        ("cameras.txt", "1 PINHOLE 8 4 5 5 4 2\n1 PINHOLE 8 4 6 5 4 2\n", "line 2: camera 1 is in the file twice"),
+        ("calib.txt", "P2: 1 2\nP2: 1 3\n", "line 2: P2 is in the file twice"),
+        ("rig.json", '{"a": {"K": 1}, "a": {"K": 2}}', '"a" appears twice in the same object'),
+    ):
+        with pytest.raises(InputError, match=re.escape(twice)):
+            read(written(tmp_path, text, file), None)
+
+
+@pytest.mark.parametrize("kind", ["folder", "list", "mapping", "xml"])
+def test_a_rig_without_cameras_is_one_line(tmp_path, kind):
+    if kind == "folder":
+        path = tmp_path / "rig"
+        (path / "x.yaml").mkdir(parents=True)
+    else:
+        texts = {"list": ("r.json", "[]"), "mapping": ("r.yaml", "cameras: {}"), "xml": ("r.xml", "<a><cameras/></a>")}
+        path = written(tmp_path, texts[kind][1], texts[kind][0])
+    with pytest.raises(
+        InputError, match=r"has no camera|contains no camera|no mapping|is not a (JSON object|regular file)"
+    ):
+        read(path, None)
+    with pytest.raises(InputError):
+        bevcli.open_sequence(STREET, calibration=path)
+
+
 def lines_of(rows):
     return "".join(f"{key}: {' '.join(map(str, np.ravel(value)))}\n" for key, value in rows.items())
 

@@ -1,6 +1,7 @@
 """Files of poses of other programs: a circle, driven at a stated speed, is the same ego-motion in every format."""
 
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -239,12 +240,40 @@ def test_times_with_two_readings_are_asked_for(tmp_path):
         (lines(S, X, Y, ZERO, *LEVEL, QZ, QW) + "1 2 3\n", "line 61 has 3 cells"),
         (lines(S, ["nan"] * COUNT, Y, ZERO, *LEVEL, QZ, QW), "expected a finite number"),
         (kitti([2 * pose for pose in camera_poses(True)]), "line 1: .* are no rotation"),
+        (kitti([pose @ np.diag([-1.0, 1, 1, 1]) for pose in camera_poses(True)]), "line 1: .*: they mirror"),
+        (kitti([pose * [[-1], [-1], [-1], [1]] for pose in camera_poses(True)]), "line 1: .*: they mirror"),
+        (lines(NS, ["0"] * COUNT, X, Y, YAW, separator=",", header="time,nsecs,x,y,yaw"), "time: .* s is too large"),
+        (lines(S, [str(2**62)] * COUNT, X, Y, YAW, separator=",", header="secs,nsecs,x,y,yaw"), "an integer|too large"),
+        (lines(["9" * 30] * COUNT, X, Y, YAW, separator=",", header="t,x,y,yaw"), "too large for a time in any unit"),
+        (lines(["1e19"] * COUNT, X, Y, YAW, separator=",", header="t,x,y,yaw"), "the last digits|too large"),
+        (lines(NS, X, Y, YAW, separator=",", header="time_s,x,y,yaw"), "too large for seconds"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_line_that_names_the_place(text, said, tmp_path):
     with pytest.raises(InputError, match=said) as error:
         read(tmp_path, text, frames=TIMES)
     assert "\n" not in str(error.value)
+
+
+def test_poses_of_a_long_drive_take_little_memory(tmp_path):
+    """The file has 6 MB, and the poses 19."""
+    count = 140_000
+    times = (START + 10**6 * np.arange(count)).tolist()
+    own, other = tmp_path / "own.csv", tmp_path / "other.csv"
+    rows = [f"{time},{place / 100:.2f},0,0,1,0,0,0\n" for place, time in enumerate(times)]
+    own.write_text("timestamp_ns,x,y,z,qw,qx,qy,qz\n" + "".join(rows))
+    other.write_text("time_ns,x,y,z,qw,qx,qy,qz\n" + "".join(rows))
+    motions = []
+    for path in (own, other):
+        tracemalloc.start()
+        try:
+            motions.append(read_poses(path, DrivePoses(RIG, RigOptions(), FRAMES)).motion)
+            assert tracemalloc.get_traced_memory()[1] < 90 << 20
+        finally:
+            tracemalloc.stop()
+    assert motions[0].timestamps_ns.tolist() == times
+    for name in ("timestamps_ns", "translations", "quaternions", "velocities", "accelerations", "angular_rates"):
+        np.testing.assert_array_equal(getattr(motions[0], name), getattr(motions[1], name))
 
 
 def test_a_drive_takes_a_file_and_says_what_it_understood(drive, tmp_path):

@@ -128,12 +128,18 @@ class Files(BaseHTTPRequestHandler):
         self.wfile.write(self.content + b"x" * 1000)
         self.close_connection = True
 
-    def absurd_length(self) -> None:
+    def absurd_length(self, digits: int = 5000) -> None:
         self.send_response(200)
-        self.send_header("Content-Length", "9" * 5000)
+        self.send_header("Content-Length", "9" * digits)
         self.end_headers()
         self.wfile.write(self.content)
         self.close_connection = True
+
+    def length_of_16_digits(self) -> None:
+        """And it stays open, as if more came."""
+        self.absurd_length(16)
+        self.wfile.flush()
+        self.stop.wait(20)
 
     def other(self) -> None:
         self.send(bytes(byte ^ 1 for byte in self.content))

@@ -18,6 +18,7 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin
 from bevcli.options import named
 from bevcli.parsing.documents import read_json
+from bevcli.parsing.files import is_file_name
 from bevcli.printing import one_line, quoted
 from bevcli.sequences.files.json_fields import Report, parse_numbers, parse_transform, require, transform_to_json
 from bevcli.sequences.files.readings import RigReading, question
@@ -133,19 +134,11 @@ def _own_file(path: Path) -> Path | None:
 
 def draft_calibration(path: Path) -> RigDraft:
     """The rig in calibration.json and all mistakes in the file. Raises InputError only if it is not a JSON object."""
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        if len(set(keys)) < len(keys):
-            twice = next(key for number, key in enumerate(keys) if key in keys[:number])
-            raise InputError(f'{path}: "{twice}" appears twice in the same object: remove or rename one')
-        return dict(pairs)
-
     missing = (
         "the file is missing (expected a calibration): pass `calibration` (`--calibration FILE`) of another kind, or "
         "`fov_deg=70` (`--fov 70`)"
     )
-    document = read_json(path, largest=LARGEST_BYTES, missing=missing, pairs=unique)
+    document = read_json(path, largest=LARGEST_BYTES, missing=missing)
     if not isinstance(document, dict):
         raise InputError(f'{path}: is not a JSON object (expected {{"format": "{FORMAT}", "cameras": {{...}}}})')
     report = Report()
@@ -276,11 +269,6 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
 def checked_camera(camera: Camera, location: Path | str) -> Camera:
     """A camera that calibration.json may hold. where: start of an error message. Raises InputError for any other."""
     return require(parse_camera, camera.name, _camera_to_json(camera), where=location, camera=camera.name)
-
-
-def is_file_name(name: str) -> bool:
-    """True for a name that a camera or a scene may have: it becomes that of a file or folder."""
-    return 0 < len(name) <= 100 and name.isprintable() and not set(name) & {"/", "\\"} and name.strip(". ") != ""
 
 
 def _parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:

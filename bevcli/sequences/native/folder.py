@@ -13,6 +13,7 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.options import named
 from bevcli.parsing.documents import read_csv
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import BoxesFile, count_classes, read_boxes
@@ -30,6 +31,7 @@ BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"
 LINES_FILE = "ground_truth_lines.json"
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
+EGO_MOTION_FILE = named(FolderOptions, "ego_motion_file")
 NO_IMAGE = "no image in frames.csv"
 
 
@@ -163,6 +165,8 @@ def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
     if use == "static":
         unread = f" ({file.name} is not read)" if is_there(file) else ""
         return ReadPoses(None, (f"the vehicle is assumed to stand still{unread}",))
+    if not is_there(file) and drive.stated.ego_motion_file is not None:
+        raise InputError(f"{file}: the file is missing (expected the vehicle's poses, of {EGO_MOTION_FILE})")
     if not is_there(file) and use == "required":
         raise InputError(
             f"{file}: the file is missing (expected the vehicle's poses): add it, "

@@ -137,7 +137,7 @@ def read_batches(path: Path) -> Iterator[Rows]:
     if not path.is_file():
         raise InputError(f"{path}: the table is missing (expected a nuScenes table)")
     if path.stat().st_size <= BATCH_BYTES:
-        yield _parse(path, read_bytes(path, BATCH_BYTES))
+        yield _parse(path, read_bytes(path, BATCH_BYTES), keys_checked=True)
         return
     with open_regular(path) as file:
         rest = file.read(BATCH_BYTES).lstrip()[1:]  # without the list's opening bracket
@@ -172,8 +172,8 @@ def places_of(tokens: NDArray[np.bytes_], table: NDArray[np.bytes_], path: Path)
     return places
 
 
-def _parse(path: Path, text: bytes) -> Rows:
-    rows = parse_json(text, path)
+def _parse(path: Path, text: bytes, *, keys_checked: bool = False) -> Rows:
+    rows = parse_json(text, path, keys_checked=keys_checked)
     if not isinstance(rows, list) or not all(type(row) is dict for row in rows):
         raise InputError(f"{path}: expected a list of rows (a nuScenes table)")
     return Rows(path, rows)

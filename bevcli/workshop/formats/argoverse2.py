@@ -163,7 +163,7 @@ def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
         raise InputError(f"{path}: has no poses (expected at least one)")
     times, first = np.unique(table.integers("timestamp_ns"), return_index=True)
     axles, quaternions = (column[first] for column in table.poses())
-    up = np.stack([rotation_from_quaternion(q)[:, 2] for q in quaternions])
+    up = rotation_from_quaternion(quaternions)[..., 2]
     poses = (times, axles - axle_height_m * up, quaternions)
     rows = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1, SPACING_NS)))
     return motion_of_keyframes((times[rows], poses[1][rows], quaternions[rows]), poses)

@@ -76,6 +76,8 @@ def read_rig(
     if fov_deg is not None:
         raise InputError("`calibration` (`--calibration`) and `fov_deg` (`--fov`) exclude each other: pass one of them")
     format_name, cameras = _read_cameras(calibration)
+    if not cameras:
+        raise InputError(f"{calibration}: {format_name}: has no camera (expected one or more)")
     if extrinsics is not None:
         poses = _extrinsics(extrinsics)
         if len(poses) == len(cameras) == 1:  # whatever each file calls it

@@ -9,20 +9,48 @@ from xml.parsers import expat
 import yaml
 
 from bevcli.errors import InputError
-from bevcli.parsing.documents import DEEPEST, check_values
+from bevcli.parsing.documents import DEEPEST, MOST_VALUES, check_values, first_twice
 from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import reason_of
 
 YAML_BYTES = MIB // 4
+MERGE_TAG = "tag:yaml.org,2002:merge"
 _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _YamlLoader(_SafeLoader):
-    """The safe loader, which makes no Python objects, and reads OpenCV's matrices as mappings."""
+    """The safe loader, which makes no Python objects, reads OpenCV's matrices as mappings and 1e-05 as a number.
+
+    A key twice in a mapping is an error, and so are more values than a file may have, merges written out.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._merged = 0  # values, each counted as often as a merge brings it
+        self._seen = set[int]()  # mappings, whose merges are written out in their nodes
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Write out the merges of a mapping, each of which comes here first."""
+        if id(node) not in self._seen:
+            self._seen.add(id(node))
+            keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != MERGE_TAG]
+            twice = first_twice([self.construct_object(key) for key in keys])
+            if twice is not None:
+                where, name = f"line {keys[twice].start_mark.line + 1}", keys[twice].value
+                raise InputError(f'{where}: "{name:.60}" appears twice in the same mapping: remove or rename one')
+        super().flatten_mapping(node)
+        self._merged += len(node.value)
+        if self._merged > MOST_VALUES:
+            raise InputError(f"has more than {MOST_VALUES} values, merges written out")
 
 
 _YamlLoader.add_constructor(
     "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+_YamlLoader.add_implicit_resolver(  # YAML 1.1 has no numbers with an exponent and without a point, YAML 1.2 has
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)[eE][-+]?[0-9]+\Z"),
+    list("-+.0123456789"),
 )
 
 
@@ -34,8 +62,10 @@ def read_yaml(path: Path) -> Any:
         for event in yaml.parse(text, _YamlLoader):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST:
-                raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
+                raise InputError(f"is nested too deeply (expected at most {DEEPEST} levels)")
         document = yaml.load(text, _YamlLoader)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     except yaml.YAMLError as error:
         raise InputError(f"{path}: broken YAML ({reason_of(error)[:200]})") from None
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError) as error:
@@ -53,8 +83,21 @@ def parse_xml(text: bytes, path: Path) -> ElementTree.Element:
     def refuse(name: str, *declaration: object) -> None:
         raise InputError(f"{path}: declares the entity {name:.40} (expected XML without entities)")
 
-    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    builder, parser, depth = ElementTree.TreeBuilder(), expat.ParserCreate(), 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > DEEPEST:
+            raise InputError(f"{path}: is nested too deeply (expected at most {DEEPEST} levels)")
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, refuse
     parser.buffer_text = True
     try:

@@ -16,7 +16,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
-from bevcli.parsing.documents import read_json
+from bevcli.parsing.documents import first_twice, read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
@@ -87,22 +87,26 @@ def read_document(path: Path) -> Any:
     if path.suffix.lower() == ".json":
         return read_json(path, largest=LARGEST_BYTES)
     if path.suffix.lower() == ".xml":
-        return _from_xml(parse_xml(read_bytes(path, YAML_BYTES), path))
+        return _from_xml(parse_xml(read_bytes(path, YAML_BYTES), path), path)
     if path.suffix.lower() == ".urdf":
         return urdf_document(parse_xml(read_bytes(path, YAML_BYTES), path))
     return read_yaml(path)
 
 
-def _from_xml(element: Element) -> Any:
-    """The value of an element that OpenCV's FileStorage writes."""
+def _from_xml(element: Element, path: Path) -> Any:
+    """The value of an element that OpenCV's FileStorage writes. Raises InputError for a name twice in an element."""
     children = list(element)
     if not children:
         words = (element.text or "").split()
         numbers = [number_of(word) for word in words]
         return (numbers if len(numbers) > 1 else numbers[0]) if words and None not in numbers else " ".join(words)
     if all(child.tag == "_" for child in children):
-        return [_from_xml(child) for child in children]
-    return {child.tag: _from_xml(child) for child in children}
+        return [_from_xml(child, path) for child in children]
+    twice = first_twice([child.tag for child in children])
+    if twice is not None:
+        tag = children[twice].tag
+        raise InputError(f'{path}: "{tag:.60}" appears twice in <{element.tag:.60}>: remove or rename one')
+    return {child.tag: _from_xml(child, path) for child in children}
 
 
 def number_of(word: str) -> float | None:

@@ -14,8 +14,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.parsing.files import is_file_name
 from bevcli.parsing.images import encode_image
-from bevcli.sequences.files.calibration_file import is_file_name
 from bevcli.sequences.nuscenes import NuScenesOptions, versions_in
 from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
 from bevcli.sequences.nuscenes.sequence import NuScenesDrive

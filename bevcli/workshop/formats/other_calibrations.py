@@ -71,6 +71,8 @@ def read_colmap(path: Path) -> Cameras:
         numbers = [number_of(word) for word in words[2:]]
         if len(words) < 4 or None in numbers:
             raise InputError(f"{where}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+        if words[0] in by_id:
+            raise InputError(f"{where}: camera {words[0]:.60} is in the file twice: keep one")
         by_id[words[0]] = replace(_colmap_camera(words[1], numbers[2:], where), size=(numbers[0], numbers[1]))
     poses, ids = dict[str, list[Array]](), dict[str, dict[str, None]]()
     images = folder / "images.txt"
@@ -273,6 +275,8 @@ def _kitti_rows(path: Path) -> dict[str, Array]:
         if not colon:
             raise InputError(f"{path}: line {number}: expected NAME: NUMBERS, as in KITTI")
         if numbers and None not in numbers:
+            if key.strip() in rows:
+                raise InputError(f"{path}: line {number}: {key.strip():.60} is in the file twice: keep one")
             rows[key.strip()] = np.array(numbers, dtype=np.float64)
     return rows
 

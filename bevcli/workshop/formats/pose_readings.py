@@ -10,6 +10,7 @@ from bevcli.sequences.files.readings import PoseReading
 from bevcli.workshop.formats.camera_poses import EGO_FROM_BODY
 
 MOVING_M_S, MOVING_M = 1.0, 2.0  # slower steps, and drives with less distance, show no direction
+COMPARED = 10_000  # of a longer drive, every second, third, … pose is compared
 STEP_S = 0.2  # between two compared poses: shorter steps are noise
 FASTEST_M_S = 80.0
 ASIDE = np.radians(25.0)  # largest angle between x and the direction of motion, on average
@@ -50,6 +51,8 @@ def of_ego(translations: Array, quaternions: Array, ego_from_body: Array) -> tup
     The world has z up: it is that of the poses, or the frame of the vehicle where the body was the world, or at the
     first pose.
     """
+    if is_level(quaternions) and np.array_equal(ego_from_body, np.eye(4)):
+        return translations, quaternions
     body, pose = Pose.from_matrix(inverse(ego_from_body)), Pose.from_matrix(ego_from_body)
     at, turned = translations + rotated(quaternions, body.translation), product(quaternions, body.quaternion[None])
     if is_level(turned):
@@ -63,20 +66,27 @@ def of_ego(translations: Array, quaternions: Array, ego_from_body: Array) -> tup
 
 def is_level(quaternions: Array) -> bool:
     """True where z of a vehicle with these rotations points up in the world."""
+    quaternions = quaternions[:: 1 + len(quaternions) // COMPARED]
     return float(np.median(rotated(quaternions, np.array([0.0, 0.0, 1.0]))[:, 2])) > LEVEL
 
 
+def compared_rows(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The indices of poses that are compared: shorter steps are noise."""
+    period = float(np.median(np.diff(times_ns))) / 1e9 if len(times_ns) > 1 else STEP_S
+    return np.arange(0, len(times_ns), max(1, round(STEP_S / period)))
+
+
 def drives_along_x(translations: Array, quaternions: Array, times_ns: NDArray[np.int64]) -> bool:
-    """False for a vehicle that moves aside, or faster than vehicles do; True for one that hardly moves."""
-    seconds = (times_ns - times_ns[0]) / 1e9
-    period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else STEP_S
-    rows = np.arange(0, len(seconds), max(1, round(STEP_S / period)))
-    steps, durations = np.diff(translations[rows], axis=0), np.diff(seconds[rows])
+    """False for a vehicle that moves aside, or faster than vehicles do; True for one that hardly moves.
+
+    times_ns: (T,) of `compared_rows`.
+    """
+    steps, durations = np.diff(translations, axis=0), np.diff(times_ns) / 1e9
     lengths = np.linalg.norm(steps, axis=1)
     moving = lengths > MOVING_M_S * durations
     if lengths[moving].sum() < MOVING_M:
         return True
-    in_ego = rotated(conjugate(quaternions[rows][:-1][moving]), steps[moving])
+    in_ego = rotated(conjugate(quaternions[:-1][moving]), steps[moving])
     aside = np.arctan2(np.linalg.norm(in_ego[:, 1:], axis=1), np.abs(in_ego[:, 0]))
     return bool(np.median(lengths[moving] / durations[moving]) < FASTEST_M_S and np.median(aside) < ASIDE)
 

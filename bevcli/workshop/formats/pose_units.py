@@ -47,22 +47,22 @@ def in_usual_units(table: Table, stated: RigOptions) -> Table:
 
 def with_numbers(table: Table, columns: Mapping[str, Array], name: str = "") -> Table:
     """The table with (T,) other or new columns. name: of those that are new."""
-    rows = [
-        CsvRow(row.path, row.line, row.cells | {key: repr(float(values[index])) for key, values in columns.items()})
-        for index, row in enumerate(table.rows)
-    ]
-    return replace(table, rows=rows, columns={**dict.fromkeys(columns, name), **table.columns})
+    return replace(table, values={**table.values, **columns}, columns={**dict.fromkeys(columns, name), **table.columns})
 
 
 def _with_fix(table: Table) -> Table:
     """The table without rows of a receiver that had no fix."""
     if not table.has("latitude", "longitude"):
         return table
-    rows = [row for row in table.rows if _has_fix(row)]
-    lost = len(table.rows) - len(rows)
-    if not rows:
+    fixes = np.fromiter(map(_has_fix, table.rows()), dtype=np.bool_, count=len(table))
+    lost = int((~fixes).sum())
+    if not fixes.any():
         raise InputError(f"{table.path}: no row has a fix: measure the motion by `odometry=True` (`--odometry`)")
-    return replace(table, rows=rows, notes=(*table.notes, f"{lost} without a fix left out")) if lost else table
+    return (
+        replace(table, spans=table.spans[fixes], notes=(*table.notes, f"{lost} without a fix left out"))
+        if lost
+        else table
+    )
 
 
 def _has_fix(row: CsvRow) -> bool:

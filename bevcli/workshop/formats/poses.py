@@ -5,13 +5,15 @@ radians, the order of a quaternion, the body and the direction of the poses) are
 decide; the unit of times follows from the times of the frames. A note says what was understood.
 """
 
+import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.oxts import read_oxts
 from bevcli.workshop.formats.pose_readings import (
     FASTEST_M_S,
+    compared_rows,
     drives_along_x,
     of_bodies,
     of_ego,
@@ -40,6 +43,7 @@ from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
+_DIGITS = re.compile(r"(\d{1,18})(?:\.(\d{0,18}))?", re.ASCII)  # a time with all of its digits
 ANGLES = ("radians", "degrees", "compass", "compass-radians")
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
@@ -84,11 +88,12 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     positions, origin = _positions(table)
     times, time_words = _times(table, positions, drive)
     table = with_course(table, positions, times)
-    for row, before, time in zip(table.rows[1:], times[:-1], times[1:], strict=True):
-        if time <= before:
-            raise InputError(f"{path}: line {row.line}: its time is not later than that of the row before: sort them")
+    late = np.diff(times) <= 0
+    if late.any():
+        line = table.spans[1 + int(late.argmax()), 0]
+        raise InputError(f"{path}: line {line}: its time is not later than that of the row before: sort them")
     _check_camera(drive)
-    readings = [each for each in _readings(table, positions, KINDS[name], drive) if _is_possible(each, times, drive)]
+    readings = list(_readings(table, positions, KINDS[name], drive, times))
     if not readings:
         raise InputError(
             f"{path}: in no reading of the poses the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
@@ -97,6 +102,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
     first = f"{name}, {counted(len(times), 'rows')}{rate}, {time_words}"
     first = ", ".join([first, *table.notes])
+    del table, positions  # of a long drive, they take as much memory as all that is derived from them
     last = ""
     if drive.times_ns is not None:
         covered = _covered(int(times[0]), int(times[-1]), drive.times_ns)
@@ -121,7 +127,9 @@ def _poses_of_ego(reading: PoseReading, rig: CameraRig) -> tuple[Array, Array]:
 
 def _is_possible(reading: PoseReading, times_ns: NDArray[np.int64], drive: DrivePoses) -> bool:
     """False where the vehicle does not drive along its x axis."""
-    return drive.rig_is_open or drives_along_x(*_poses_of_ego(reading, drive.rig), times_ns)
+    rows = compared_rows(times_ns)
+    few = replace(reading, translations=reading.translations[rows], quaternions=reading.quaternions[rows])
+    return drive.rig_is_open or drives_along_x(*_poses_of_ego(few, drive.rig), times_ns[rows])
 
 
 def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
@@ -131,18 +139,19 @@ def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
     if not table.has("latitude", "longitude"):
         return table.numbers(*VECTOR), None
     degrees, up = table.numbers("latitude", "longitude"), table.numbers("altitude")
-    for row, (latitude, longitude) in zip(table.rows, degrees, strict=True):
-        if abs(latitude) > 90 or abs(longitude) > 360:
-            raise row.error("latitude", f"{latitude:g}, {longitude:g} is no place on Earth (expected degrees)")
+    wrong = (np.abs(degrees) > (90, 360)).any(axis=1)
+    if wrong.any():
+        latitude, longitude = degrees[row := int(wrong.argmax())]
+        raise table.row(row).error("latitude", f"{latitude:g}, {longitude:g} is no place on Earth (expected degrees)")
     origin = GeoOrigin(float(degrees[0, 0]), float(degrees[0, 1]), EAST_DEG)
     return np.column_stack([origin.points(degrees), up - up[0]]), origin
 
 
 def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[np.int64], str]:
     """(T,) times in ns, and what was understood. KITTI's are in times.txt beside, or those of the frames."""
-    rows, name = table.rows, table.columns.get("time", "")
+    row, name = table.row, table.columns.get("time", "")
     if table.has(*MATRIX):
-        path, count = table.path, len(rows)
+        path, count = table.path, len(table)
         beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
         file = next((each for each in beside if is_there(each)), None)
         if file is None and (drive.times_ns is None or count != len(drive.times_ns)):
@@ -155,23 +164,64 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
         lines = [line for line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1) if line[1].strip()]
         if len(lines) != count:
             raise InputError(f"{file}: has {len(lines)} times (expected {count}, one for each line of {path.name})")
-        rows = [CsvRow(file, number, {"time": text.strip()}) for number, text in lines]
+        texts: Iterable[str] = [text.strip() for _, text in lines]
+
+        def row(index: int) -> CsvRow:
+            return CsvRow(file, lines[index][0], {"time": lines[index][1].strip()})
+
     elif table.has("nanoseconds") and (seconds := next((each for each in ("seconds", "time") if table.has(each)), "")):
-        both = [row.integer(seconds) * 10**9 + row.integer("nanoseconds") for row in rows]
-        return np.array(both, dtype=np.int64), "seconds and nanoseconds"
+        return _both(table, seconds), "seconds and nanoseconds"
     elif not table.has("time"):
         examples = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
         raise InputError(f"{table.path}: a column of times is missing (expected a name such as {examples})")
-    values = [_decimal(row) for row in rows]
+    else:
+        texts = table.texts("time")
+    whole, rest = _exact(texts, row)
     unit_in_name = _UNIT_OF_NAME.search(name)
     of_name = cast("TimeKind | None", unit_in_name and (unit_in_name[1] or unit_in_name[2]))
-    unit = drive.stated.pose_times or of_name or _unit(table.path, values, positions, drive)
-    if max(map(abs, values)) * UNITS_NS[unit] > LARGEST_INTEGER:
+    unit = drive.stated.pose_times or of_name or _unit(row(0), whole, rest, positions, drive)
+    if int(np.abs(whole).max()) * UNITS_NS[unit] > LARGEST_INTEGER:
         raise InputError(
-            f"{rows[0].path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)"
+            f"{row(0).path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)"
         )
-    times = np.array([int((value * UNITS_NS[unit]).to_integral_value()) for value in values], dtype=np.int64)
+    times = _nanoseconds(whole, rest, unit)
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
+
+
+def _both(table: Table, seconds: str) -> NDArray[np.int64]:
+    """Seconds of a column and nanoseconds of another one."""
+    times = array("q")
+    for row in table.rows():
+        time = row.integer(seconds) * 10**9 + row.integer("nanoseconds")
+        if abs(time) > LARGEST_INTEGER:
+            advice = (
+                f"is its unit seconds? Remove the column {table.columns['nanoseconds']}, if that has all of the time"
+            )
+            raise row.error(table.columns[seconds], f"{row.cells[seconds]} s is too large for a time: {advice}")
+        times.append(time)
+    return np.array(times)
+
+
+def _exact(texts: Iterable[str], row: Callable[[int], CsvRow]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(T,) times without a unit, in all of their digits: whole numbers, and the rest in 1e-18. row: by its index."""
+    whole, rest = array("q"), array("q")
+    for index, text in enumerate(texts):
+        if (plain := _DIGITS.fullmatch(text)) is not None:
+            whole.append(int(plain[1]))
+            rest.append(int((plain[2] or "").ljust(18, "0")))
+            continue
+        value = _decimal(row(index))
+        if abs(value) > LARGEST_INTEGER:
+            raise row(index).error("time", f'"{text:.24}" is too large for a time in any unit')
+        whole.append(math.floor(value))
+        rest.append(int((value - whole[-1]).scaleb(18)))
+    return np.array(whole), np.array(rest)
+
+
+def _nanoseconds(whole: NDArray[Any], rest: NDArray[np.int64], unit: TimeKind) -> NDArray[np.int64]:
+    """(T,) times of `_exact` in a unit, to the nearest nanosecond."""
+    step = 10**18 // UNITS_NS[unit]
+    return whole * UNITS_NS[unit] + (rest + step // 2) // step
 
 
 def _decimal(row: CsvRow) -> Decimal:
@@ -193,10 +243,12 @@ def _decimal(row: CsvRow) -> Decimal:
     return value
 
 
-def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePoses) -> TimeKind:
+def _unit(
+    first: CsvRow, whole: NDArray[np.int64], rest: NDArray[np.int64], positions: Array, drive: DrivePoses
+) -> TimeKind:
     """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
     units = list(UNITS_NS)
-    steps = np.array([float(time - times[0]) for time in times])
+    steps = (whole - whole[0]) + (rest - rest[0]) / 1e18
     durations, lengths = np.diff(steps), np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if len(durations) and (durations > 0).any():
         period = float(np.median(durations[durations > 0])) / 1e9
@@ -205,21 +257,21 @@ def _unit(path: Path, times: Sequence[Decimal], positions: Array, drive: DrivePo
             unit for unit, ns in UNITS_NS.items()
             if PERIODS_S[0] <= period * ns <= PERIODS_S[1] and speed / ns <= FASTEST_M_S
         ] or units  # fmt: skip
+    ends = {unit: _nanoseconds(whole[[0, -1]].astype(object), rest[[0, -1]], unit).tolist() for unit in units}
     if drive.times_ns is not None:
-        ends = {unit: (times[0] * UNITS_NS[unit], times[-1] * UNITS_NS[unit]) for unit in units}
-        covered = {unit: _covered(*ends[unit], drive.times_ns) for unit in units}
+        covered = {unit: _covered(ends[unit][0], ends[unit][1], drive.times_ns) for unit in units}
         units = [unit for unit in units if covered[unit] == max(covered.values())]
-    recent = [unit for unit in units if SINCE_1970_NS[0] <= times[0] * UNITS_NS[unit] <= SINCE_1970_NS[1]]
+    recent = [unit for unit in units if SINCE_1970_NS[0] <= ends[unit][0] <= SINCE_1970_NS[1]]
     units = recent or units
     if len(units) > 1:
         words = " or ".join(WORDS[unit] for unit in units)
         options = " or ".join(f"`pose_times={unit}` (`--pose-times`)" for unit in units)
-        message = f"{path}: the times ({times[0]:f}, …) may be {words}: pass {options}"
+        message = f"{first.path}: the times ({first.cells['time']:.40}, …) may be {words}: pass {options}"
         raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
     return units[0]
 
 
-def _covered(first: Decimal | int, last: Decimal | int, times_ns: NDArray[np.int64]) -> int:
+def _covered(first: int, last: int, times_ns: NDArray[np.int64]) -> int:
     """Number of frames that poses from `first` to `last`, ns, cover."""
     return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
 
@@ -232,7 +284,9 @@ def _check_camera(drive: DrivePoses) -> None:
         )
 
 
-def _readings(table: Table, positions: Array, kind: Kind, drive: DrivePoses) -> Iterator[PoseReading]:
+def _readings(
+    table: Table, positions: Array, kind: Kind, drive: DrivePoses, times_ns: NDArray[np.int64]
+) -> Iterator[PoseReading]:
     """What the poses may be, the usual first: those of KITTI are of its camera 0."""
     rotations, cameras = _rotations(table, drive), list(drive.rig.names)
     stated = {name: getattr(drive.stated, name) for name in ("poses_of", "pose_axes", "pose_transform")}
@@ -243,7 +297,9 @@ def _readings(table: Table, positions: Array, kind: Kind, drive: DrivePoses) -> 
         cameras, stated["pose_transform"] = [], stated["pose_transform"] or "world_from_body"
     if of_gps:
         stated["pose_axes"] = stated["pose_axes"] or "flu"
-    readings = of_bodies(positions, rotations, cameras, stated)
+    readings = (
+        each for each in of_bodies(positions, rotations, cameras, stated) if _is_possible(each, times_ns, drive)
+    )
     zeroth = next((name for name in cameras if re.search("(?<![0-9])0+$", name)), "")
     zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
     yield from sorted(readings, key=lambda each: kind.of_camera and each.camera != zeroth)
@@ -254,10 +310,14 @@ def _rotations(table: Table, drive: DrivePoses) -> dict[str, Array]:
     if table.has(*MATRIX):
         matrices = table.numbers(*MATRIX).reshape(-1, 3, 4)[..., :3]
         errors = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        if errors.max() > ROTATION_TOLERANCE or np.linalg.det(matrices).min() < 0:
-            row = table.rows[int(((errors > ROTATION_TOLERANCE) | (np.linalg.det(matrices) < 0)).argmax())]
-            raise InputError(f"{row.path}: line {row.line}: the first three columns of its matrix are no rotation")
-        return {"": np.stack([quaternion_from_rotation(matrix) for matrix in matrices])}
+        for wrong, why in (
+            (errors > ROTATION_TOLERANCE, ""), (np.linalg.det(matrices) < 0, ": they mirror (determinant -1)"),
+        ):  # fmt: skip
+            if wrong.any():
+                line = table.spans[int(wrong.argmax()), 0]
+                what = f"the first three columns of its matrix are no rotation{why}"
+                raise InputError(f"{table.path}: line {line}: {what}")
+        return {"": quaternion_from_rotation(matrices)}
     if table.has(*QUATERNION):
         return _of_quaternions(table, drive)
     if table.has("yaw") or table.has("heading"):
@@ -274,7 +334,7 @@ def _of_quaternions(table: Table, drive: DrivePoses) -> dict[str, Array]:
     if wrong.any():
         row = int(wrong.argmax())
         message = f"the quaternion's norm is {norms[row]:.6g} (expected 1): check its digits"
-        raise table.rows[row].error("qw..qz", message)
+        raise table.row(row).error("qw..qz", message)
     quaternions = quaternions / norms[:, None]
     order = "wxyz" if next(name for name in table.columns if name in QUATERNION) == "qw" else "xyzw"
     orders = {order: quaternions}

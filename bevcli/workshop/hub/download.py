@@ -15,14 +15,16 @@ from typing import Any
 import msgspec
 
 from bevcli._version import __version__
-from bevcli.errors import BevcliError, WeightsError
-from bevcli.parsing.files import MIB, hash_of_file, read_bytes
-from bevcli.printing import reason_of
+from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.parsing.documents import parse_json
+from bevcli.parsing.files import MIB, hash_of_file, is_file_name, read_bytes
+from bevcli.printing import one_line, reason_of
 from bevcli.published import HubModel, Known
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 FORMAT = 1  # of config.json; increase it when an earlier bevcli cannot read it
 _NAME = re.compile(r"hf:([\w.-]+/[\w.-]+)(?:@([\w.][\w./-]*))?")
+NAMES = ("ETag", "X-Linked-Etag", "X-Repo-Commit", "X-Xet-Hash")  # headers of which huggingface_hub makes paths
 COMMIT_DIGITS = 12
 TELEMETRY = "HF_HUB_DISABLE_TELEMETRY"
 
@@ -43,7 +45,7 @@ def open_model(name: str, *, fetch: bool = False) -> HubModel:
     if folder_name.startswith((".", "/", "~")):
         return read_folder(Path(folder_name).expanduser(), f"model in {folder_name}")
     match = _NAME.fullmatch(name)
-    if match is None:
+    if match is None or not all(map(is_file_name, (match[2] or "main").split("/"))):
         raise WeightsError(
             f"`model={name}` (`--model`): is no model of the Hugging Face Hub (expected hf:OWNER/NAME, "
             "hf:OWNER/NAME@REVISION or hf:./FOLDER)"
@@ -58,16 +60,16 @@ def _snapshot(repository: str, revision: str | None, fetch: bool) -> Path:
     """The folder of a commit in the cache, with both files. Raises WeightsError."""
     hub = import_hub(f"hf:{repository}")
     errors = hub.errors
-    if not fetch:  # huggingface_hub has another function that looks into the cache, but it connects for its headers
-        cached = [hub.try_to_load_from_cache(repository, file, revision=revision) for file in (CONFIG, WEIGHTS)]
-        if all(isinstance(path, str) for path in cached):
-            return Path(cached[0]).parent
 
     def get(file: str, revision: str | None) -> Path:
         version = {"library_name": "bevcli", "library_version": __version__}
         return Path(hub.hf_hub_download(repository, file, revision=revision, **version))
 
     try:
+        if not fetch:  # huggingface_hub has another function that looks into the cache, but it connects for its headers
+            cached = [hub.try_to_load_from_cache(repository, file, revision=revision) for file in (CONFIG, WEIGHTS)]
+            if all(isinstance(path, str) for path in cached):
+                return Path(cached[0]).parent
         if fetch:  # a download would take what is in the cache if the Hub gives no answer
             hub.get_hf_file_metadata(hub.hf_hub_url(repository, CONFIG, revision=revision))
         folder = get(CONFIG, revision).parent
@@ -81,6 +83,7 @@ def _snapshot(repository: str, revision: str | None, fetch: bool) -> Path:
             "`hf auth login`",
             (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled): "is not in the cache, and cannot be "
             f"downloaded: check the network, HF_ENDPOINT and HF_HUB_OFFLINE ({cause})",
+            (errors.HFValidationError,): f"is no name of a model of the Hub ({cause})",
             (errors.EntryNotFoundError,): f"is no model of bevcli: it lacks {CONFIG} or {WEIGHTS}",
         }
         reason = next((text for kinds, text in reasons.items() if isinstance(error, kinds)), None)
@@ -98,12 +101,40 @@ def import_hub(what: str = "hf:OWNER/NAME") -> Any:
     try:
         for module in ("constants", "errors"):
             importlib.import_module(f"huggingface_hub.{module}")
-        return importlib.import_module("huggingface_hub")
-    except ImportError:
+        hub = importlib.import_module("huggingface_hub")
+        _check_answers(hub)
+        return hub
+    except (ImportError, AttributeError):
         raise BevcliError(f"{what}: needs huggingface_hub: run pip install 'bevcli[hub]'") from None
     finally:
         if before is None:
             del os.environ[TELEMETRY]
+
+
+def _check_answers(hub: Any) -> None:
+    """Have huggingface_hub check every answer of a server: it makes paths in its cache of names in the headers."""
+    http = importlib.import_module("huggingface_hub.utils._http")
+    make_client = http._GLOBAL_CLIENT_FACTORY  # the user's own, where one was set
+    if getattr(make_client, "checks_names", False):
+        return
+
+    def checking_client() -> Any:
+        client = make_client()
+        client.event_hooks["response"].append(_check_names)
+        return client
+
+    checking_client.checks_names = True  # type: ignore[attr-defined]
+    hub.set_client_factory(checking_client)
+
+
+def _check_names(answer: Any) -> None:
+    """Raise WeightsError where a name in the headers of a server's answer would lead out of its folder."""
+    for header in NAMES if answer.request.method == "HEAD" else ():  # in other answers they name nothing
+        name = answer.headers.get(header, "").removeprefix("W/").strip('"')
+        if name and not is_file_name(name):
+            raise WeightsError(
+                f"{answer.request.url.host}: the server's {header} is no name of a file ({one_line(name, 60)}): refused"
+            )
 
 
 class PackedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,10 +163,12 @@ def read_folder(folder: Path, source: str, mend: str = "pack the model anew") ->
     source: for texts. mend: what to do about damaged weights. Raises WeightsError.
     """
     path = folder / CONFIG
+    content = read_bytes(path, MIB, error=WeightsError)
     try:
-        config = msgspec.json.decode(read_bytes(path, MIB, error=WeightsError), type=PackedConfig)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise WeightsError(f"{path}: is not of `bevcli weights pack` ({error})") from None
+        config = msgspec.convert(parse_json(content, path), PackedConfig)
+    except (msgspec.MsgspecError, InputError) as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise WeightsError(f"{path}: is not of `bevcli weights pack` ({reason})") from None
     if config.library_name != "bevcli" or config.format != FORMAT:
         identity = f"library {config.library_name:.60}, format {config.format}"
         raise WeightsError(

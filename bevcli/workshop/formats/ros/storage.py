@@ -352,7 +352,7 @@ def _cdr(topic: Topic) -> Decode:
 
 def _json(topic: Topic) -> Decode:
     # Objects with attributes in place of dicts.
-    return lambda data: parse_json(data, Path(topic.name), pairs=lambda pairs: SimpleNamespace(**dict(pairs)))
+    return lambda data: parse_json(data, Path(topic.name), made=lambda fields: SimpleNamespace(**fields))
 
 
 def _protobuf(topic: Topic) -> Decode:
