@@ -52,7 +52,8 @@ def is_information(path: Path) -> bool:
         return False
     with open_regular(path) as file:
         head = file.read(HEAD_BYTES)
-    return any(f'"{name}"'.encode() in head for name in (*LISTS, "cam_intrinsic"))
+    named = {name for name in (*LISTS, "cams", "images", "cam_intrinsic") if f'"{name}"'.encode() in head}
+    return not named.isdisjoint(LISTS) or len(named) > 1
 
 
 def read_information(path: Path) -> Cameras:
