@@ -1,0 +1,57 @@
+"""A true drive in the conventions of other programs is read right, or a question names the options that decide."""
+
+from pathlib import Path
+
+import pytest
+from tests.readings.stated_drive import Convention, choices_of, opened, write, wrong
+
+from bevcli.errors import InputError
+from bevcli.sequences.open import open_sequence
+
+STREET = Path(__file__).parents[2] / "samples/street"
+CONVENTIONS = {
+    "lidar of nuScenes": Convention(rig_axes="rfu", transform="T_cam_ego"),
+    "north, east, down": Convention(rig_axes="frd", body="frd", rotation="quaternion", transform="T"),
+    "poses of a camera to the world": Convention(body="camera", pose_transform="body_from_world"),
+    "centimetres above an IMU": Convention(unit="cm", origin_m=0.55, rotation="rpy"),
+    "KITTI's rows of a vehicle": Convention(file="kitti", rotation="vector", transform="T"),
+}
+
+
+@pytest.fixture(scope="module")
+def street():
+    return open_sequence(STREET, every=2, frames=slice(0, 3), ground_truth=False)
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_the_images_tell_what_files_mean(name, street, tmp_path):
+    options = write(street, tmp_path, CONVENTIONS[name])
+    found = opened(tmp_path, options)
+    assert wrong(found, street) == ""
+    assert "the images: " in " ".join(found.notes)
+
+
+def test_without_images_each_answer_is_taken_and_one_is_right(street, tmp_path):
+    options = write(street, tmp_path, Convention(rig_axes="frd", body="frd"))
+    with pytest.raises(InputError) as asked:
+        opened(tmp_path, options, image_check=False)
+    answers = choices_of(asked.value)
+    assert len(answers) > 1
+    results = [wrong(opened(tmp_path, options, image_check=False, height=1.53, **answer), street) for answer in answers]
+    assert results.count("") == 1
+
+
+def test_a_vehicle_that_stands_is_a_question(street, tmp_path):
+    names = {name: f"cam{place}" for place, name in enumerate(street.rig.names)}
+    options = write(street, tmp_path, Convention(rig_axes="rfu"), names)
+    rows = options["ego_motion_file"].read_text().split("\n")
+    standing = [" ".join([row.split()[0], "0 0 0 0 0 0 1"]) for row in rows if row]
+    options["ego_motion_file"].write_text("\n".join(standing))
+    for folder in (tmp_path / "drive/images").iterdir():
+        first, *others = sorted(folder.iterdir())
+        for other in others:
+            other.write_bytes(first.read_bytes())
+    with pytest.raises(InputError, match=r"the images do not tell .*`--rig-axes rfu`") as asked:
+        opened(tmp_path, options)
+    assert {"rig_axes": "rfu"} in choices_of(asked.value)
+    assert opened(tmp_path, options, rig_axes="rfu").rig.names
