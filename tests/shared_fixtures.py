@@ -1,6 +1,7 @@
 """Fixtures of all tests: a tiny model, the folder of the reference data, and what the program sets or starts once."""
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -70,6 +71,16 @@ def shared() -> Path:
     if not folder:
         pytest.skip("BEVCLI_SHARED is not set: no real frames and reference numbers here")
     return Path(folder)
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A folder with the sample street as a clone has it, but for its frames after the fourth."""
+    street = tmp_path / "samples" / "street"
+    shutil.copytree(Path(__file__).parents[1] / "samples" / "street", street)
+    lines = (street / "frames.csv").read_text().splitlines()
+    (street / "frames.csv").write_text("\n".join(lines[:5]))
+    return tmp_path
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import contextlib
 import re
 import shlex
-import shutil
 from pathlib import Path
 
 import pytest
@@ -20,24 +19,14 @@ def blocks(language: str) -> list[str]:
     return [block for name, block in BLOCKS if name == language]
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A folder with the sample as a clone has it, but for its frames after the fourth."""
-    street = tmp_path / "samples" / "street"
-    shutil.copytree(ROOT / "samples" / "street", street)
-    lines = (street / "frames.csv").read_text().splitlines()
-    (street / "frames.csv").write_text("\n".join(lines[:5]))
-    return tmp_path
-
-
-def test_the_commands_run(folder: Path) -> None:
+def test_the_commands_run(clone: Path) -> None:
     lines = [line for block in blocks("sh") for line in block.splitlines() if line]
     assert len(lines) > 5
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == "bevcli"
         if not OPENS_A_VIEWER.match(line):
-            done = command(folder, *arguments)
+            done = command(clone, *arguments)
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
@@ -50,11 +39,11 @@ def test_how_far_official_weights_are_tested_is_said_once() -> None:
 
 
 @pytest.mark.slow  # test_documents.py runs the same calls
-def test_the_python_example_writes_a_recording(folder: Path) -> None:
+def test_the_python_example_writes_a_recording(clone: Path) -> None:
     [example] = blocks("python")
-    with contextlib.chdir(folder):
+    with contextlib.chdir(clone):
         exec(example, {})
-    assert (folder / "street.rrd").stat().st_size > 100_000
+    assert (clone / "street.rrd").stat().st_size > 100_000
 
 
 def test_readme_and_weights_page_name_what_weights_list_does(monkeypatch, tmp_path):
