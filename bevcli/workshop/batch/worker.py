@@ -124,7 +124,7 @@ class Worker:
                 "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
-                **_agreement_columns(sequence, aside),
+                **(_agreement_columns(sequence, aside) if scores is None else {}),
                 "input_errors": "; ".join(summary.input_errors),
             }
             _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")

@@ -1,6 +1,7 @@
 """`bevcli eval`: scores predictions."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,6 +88,7 @@ def _print_agreement(
     from bevcli.workshop.scores.inputs import open_predictions
     from bevcli.workshop.trust.estimate import agreement_of_boxes, as_document
 
-    file, drive = open_predictions(predictions, source.class_map), bevcli.open_sequence(path, source, **format_options)
+    file = open_predictions(predictions, source.class_map)
+    drive = bevcli.open_sequence(path, replace(source, ego_motion="optional"), **format_options)
     found = agreement_of_boxes(file.boxes, drive, file.range_m, worst=worst)
     say(json.dumps(as_document(found, [(drive.name, found)]), indent=1) if as_json else found.table())
