@@ -139,7 +139,8 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
     else:
         if model not in models:
             names = ", ".join(dict.fromkeys([*models, *published]))
-            raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml')
+            packed = f'; the folder is named "hf:./{model}"' if Path(model).is_dir() else ""
+            raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml{packed}')
         file = f"{model}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")
     contents = parse_toml(text, file, ConfigError)

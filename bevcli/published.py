@@ -209,6 +209,8 @@ def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     """A name of the table of sources. Raises WeightsError for another one."""
     weights = all_weights(folder)
     if name not in weights:
+        if resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file():
+            raise WeightsError(f'the weights of "{name}" are in the package: pass `model={name}` (`--model {name}`)')
         raise WeightsError(f'no weights are known as "{name}" (expected one of {", ".join(weights)})')
     return weights[name]
 

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from bevcli import registry
 from bevcli.cli.main import app
 from bevcli.config import TRAINING, as_table, config_of_table, known_models, load_config, load_table, read_model_file
-from bevcli.errors import BevcliError, ConfigError
+from bevcli.errors import BevcliError, ConfigError, WeightsError
+from bevcli.published import named_weights
 from bevcli.registry import OWN, Group
 from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
@@ -273,3 +274,12 @@ def test_a_broken_command_of_a_package_costs_a_warning(installed):
     assert CliRunner().invoke(app, ["export", "--help"]).exit_code == 0
     with pytest.raises(BevcliError, match="a_package_that_is_missing:run cannot be imported"):
         CliRunner().invoke(app, ["broken"], catch_exceptions=False)
+
+
+def test_the_folder_of_a_packed_model_is_named_as_the_hub_names_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("packed").mkdir()
+    with pytest.raises(ConfigError, match=r'unknown model "packed".*the folder is named "hf:\./packed"'):
+        load_config("packed")
+    with pytest.raises(WeightsError, match='the weights of "photographs" are in the package'):
+        named_weights("photographs")

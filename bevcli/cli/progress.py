@@ -1,6 +1,7 @@
 """Progress of a command on stderr: a bar on a terminal, about ten plain lines on a pipe."""
 
 import os
+import re
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -59,7 +60,8 @@ class Progress:
             self._bar.add_task("", total=self.total, state=self.state())
             self._bar.start()
         for note in self._notes:
-            self.message(f"note: {note}")
+            for line in re.split(r"\n(?=  )", f"note: {note}"):  # rows of a table are indented
+                self.message(line)
         return self
 
     def __exit__(self, *error: object) -> None:

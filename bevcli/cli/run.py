@@ -17,6 +17,7 @@ from bevcli.printing import print_note, say
 from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.format import format_of
+from bevcli.sequences.native import holds_videos_alone
 from bevcli.sequences.options import InputOptions
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.checks.standing_check import StandingCheck
 
 PANEL = "Run"
+FAST = 1.5  # times the rate of the training, from which on a drive gets a note
 
 
 def run(
@@ -69,9 +71,12 @@ def run(
         gc.freeze()  # later collections do not look at these objects either
     model, why = choose_model(model, [sequence])
     loaded = load_with_bar(model)
-    without_poses = not (format_options.get("ego_motion_file") or format_of(sequence).has_poses)
-    if source.ego_motion == "required" and without_poses and not source.odometry:
+    may_have_poses = format_of(sequence).has_poses and not holds_videos_alone(sequence)
+    if source.ego_motion == "required" and not (
+        format_options.get("ego_motion_file") or may_have_poses or source.odometry
+    ):
         run_options = replace(run_options, temporal=False)
+        why += ("without poses no history is used (`odometry=True` (`--odometry`) measures them from the images)",)
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = open_with_bar(sequence, source, format_options)
     if calibrate:
@@ -89,7 +94,7 @@ def run(
     options, path = replace(run_options, recording=recording), shlex.quote(str(sequence))
     files = run_in_folder(loaded, drive, out, options, live=live, force=output.force, resume=output.resume, source=path)
     with StopSignals("frame") as signals, files as running:
-        notes = [*why, *running.summary.input_errors, *_run_notes(loaded, drive, live=output.live)]
+        notes = [*why, *running.summary.input_errors, *_run_notes(loaded, drive, run_options, live=output.live)]
         with Progress(len(drive.stamps), "frames", notes) as progress:
             progress.skip(running.done)
             for frame, prediction in running.frames:
@@ -111,8 +116,10 @@ def run(
     say(f"next     bevcli viz {shlex.quote(str(out))}")
 
 
-def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[str]:
+def _run_notes(model: "Model", drive: "Drive", options: RunOptions, *, live: bool = False) -> list[str]:
     """Notes on a model and a drive before the run starts. live: whether a viewer follows the run."""
+    from bevcli.recording.blueprint import frame_rate_hz
+
     notes = list(drive.notes)
     if model.untrained:
         notes.append("the weights are UNTRAINED: random weights, the boxes are meaningless")
@@ -123,6 +130,13 @@ def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[st
         notes.append(f"{model.weights}: left out {model.left_out}, which a run does not need")
     if model.not_read:
         notes.append(f"{model.weights}: objects that were not read, and not run: {', '.join(model.not_read)}")
+    rate_hz, trained_hz = frame_rate_hz(drive.stamps), model.config.rate_hz
+    if options.temporal and model.config.uses_history and rate_hz > FAST * trained_hz:
+        notes.append(
+            f"{rate_hz:.3g} frames per second: the model learned its history at {trained_hz:g} "
+            f"(`rate_hz={trained_hz:g}` (`--rate {trained_hz:g}`) thins the drive, `temporal=False` (`--no-temporal`) "
+            "runs each frame alone)"
+        )
     later = model.config.later_frames
     if live and later:
         notes.append(f"model {model.name} looks ahead: the viewer shows a frame when {later} more are read")
@@ -130,7 +144,11 @@ def _run_notes(model: "Model", drive: "Drive", *, live: bool = False) -> list[st
     if model.bundled and not drive.facts.rendered:
         learned = f"these weights were trained on rendered streets; `--model {PHOTOGRAPHS}` finds more on photographs"
         if model.name == PHOTOGRAPHS:
-            learned = "near cars and people are found as in photographs, all else as learned from rendered streets"
+            learned = (
+                "near cars and people are found as in photographs; barriers, cones, trailers and construction vehicles "
+                f"were seen in renderings only; boxes reach {model.config.bev_grid.nearest_side_m:g} m, and a wrong "
+                "height of the camera, hills and hidden feet displace them"
+            )
         notes.append(f"{learned} (docs/model-card.md)")
     return notes
 

@@ -35,8 +35,8 @@ weights_app = typer.Typer(
 def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], as_json: Json = False) -> None:
     """List published weights by name.
 
-    Each has the scores that are published for it (nuScenes validation split, in per cent), its size, its licence, and
-    where it lies on this machine or is published. Connects to no other machine.
+    Each has the scores that are published for it (nuScenes validation split, in per cent), its licence, where it lies
+    on this machine or is published, and its size where it is stated or the file is here. Connects to no other machine.
     """
     from bevcli.published import all_weights, own_table
 
@@ -45,7 +45,7 @@ def list_weights(options: Annotated[ModelOptions, Part(only=("weights_dir",))], 
         say(json.dumps([_named_as_data(item) for item in weights], indent=1))
         return
     say(_named_as_text(weights))
-    say(f"\nthe weights of demo are in the package; your own names go into {own_table()}")
+    say(f"\nthe weights of demo and photographs are in the package; your own names go into {own_table()}")
 
 
 @weights_app.command(cls=PlainCommand)

@@ -66,3 +66,13 @@ def test_rich_progress_is_imported_only_for_a_bar():
 @pytest.mark.parametrize(("seconds", "words"), [(7.6, "8 s"), (125, "2 min 05 s"), (4320, "1 h 12 min")])
 def test_durations_in_words(seconds, words):
     assert duration(seconds) == words
+
+
+def test_a_table_in_a_note_keeps_its_rows_and_nothing_else_makes_a_line(capsys):
+    with Progress(1, "frames", ["topics:\n  CAM  /cam/image", "a name\nerror: forged"]):
+        pass
+    assert capsys.readouterr().err.splitlines() == [
+        "note: topics:",
+        "  CAM  /cam/image",
+        "note: a name\\nerror: forged",
+    ]

@@ -157,11 +157,18 @@ def test_a_missing_image_is_a_warning_and_with_strict_an_error(tmp_path):
 def test_the_note_on_rendered_streets_is_for_other_drives_only(mini_model):
     bundled = replace(Model(mini_model), bundled=True)
     drive = MemoryDrive(1)
-    notes = "\n".join(_run_notes(bundled, drive))
+    notes = "\n".join(_run_notes(bundled, drive, RunOptions()))
     assert "these weights were trained on rendered streets" in notes
     assert "`--model photographs` finds more" in notes
     drive.facts = replace(drive.facts, rendered=True)
-    assert "trained on rendered streets" not in "\n".join(_run_notes(bundled, drive))
+    assert "trained on rendered streets" not in "\n".join(_run_notes(bundled, drive, RunOptions()))
+
+
+def test_a_drive_far_above_the_rate_of_the_training_gets_a_note(mini_model):
+    """The model's rate is 2 frames per second."""
+    for step_s, temporal, is_noted in ((0.1, True, True), (0.1, False, False), (0.4, True, False)):
+        notes = _run_notes(Model(mini_model), MemoryDrive(3, step_s=step_s), RunOptions(temporal=temporal))
+        assert any("10 frames per second: the model learned its history at 2 " in note for note in notes) == is_noted
 
 
 def run(config, out, frames, *, force=False):

@@ -11,6 +11,7 @@ import pytest
 from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
+from bevcli.sequences.native import holds_videos_alone
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.videos import VideoReader
 from bevcli.workshop.formats.video_times import container_times_ns
@@ -193,3 +194,11 @@ def test_the_times_of_an_even_video_are_those_of_its_rate(tmp_path, rate, suffix
     sequence = open_sequence(path, fov_deg=65, height=1.5, ego_motion="static")
     assert [each.timestamp_ns for each in sequence.stamps] == [round(n * 1e9 / rate) for n in range(20)]
     assert times is None or np.abs(times - [n * 1e9 / rate for n in range(20)]).max() < 1e6
+
+
+def test_videos_alone_may_do_without_poses(tmp_path):
+    (tmp_path / "videos").mkdir()
+    assert holds_videos_alone(tmp_path)
+    (tmp_path / "calibration.json").touch()
+    assert not holds_videos_alone(tmp_path)
+    assert not holds_videos_alone(tmp_path / "videos")

@@ -21,6 +21,11 @@ RATES_HZ = (0.001, 10_000.0)
 LARGEST_NS = 1 << 61  # of a stated time, so that sums have 64 bits
 
 
+def holds_videos_alone(path: Path) -> bool:
+    """True for a folder of videos with no other part of a drive, which may do without poses as a single video may."""
+    return [name for name in MARKERS if (path / name).exists()] == ["videos"]
+
+
 @options("Input")
 class FolderOptions(RigOptions):
     """The rig, and the times of images that no frames.csv lists."""
