@@ -67,13 +67,13 @@ INFORMATION = {
 
 
 @pytest.mark.parametrize("names", INFORMATION)
-@pytest.mark.parametrize("suffix", [".pkl", ".json"])
-def test_information_files_of_bevdet_and_mmdetection3d(tmp_path, names, suffix):
+@pytest.mark.parametrize("form", [0, 2, 4, 5, "json"])
+def test_information_files_of_bevdet_and_mmdetection3d(tmp_path, names, form):
     key = "data_list" if "2img" in names or names == "cam2ego" else "infos"
     document = {key: INFORMATION[names], "metadata": {"version": "v1.0-mini"}}
-    path = tmp_path / f"nuscenes_infos_val{suffix}"
-    if suffix == ".pkl":
-        path.write_bytes(pickle.dumps(document))
+    path = tmp_path / f"nuscenes_infos_val.{'json' if form == 'json' else 'pkl'}"
+    if form != "json":  # the protocol of a pickle
+        path.write_bytes(pickle.dumps(document, protocol=form))
     else:
         path.write_text(json.dumps(document, default=lambda array: array.tolist()))
     found = read(path)
@@ -105,6 +105,9 @@ def test_a_mistake_in_an_information_file_is_one_line(tmp_path, entries, message
         read(path)
     path.write_bytes(pickle.dumps({"infos": entries})[:20])
     with pytest.raises(InputError, match="cannot be read as a pickle"):
+        read(path)
+    path.write_bytes(b"\x80\x04Nr\xff\xff\xff\x7f.")  # a memo of 2 billion places
+    with pytest.raises(InputError, match="it is damaged"):
         read(path)
     assert capsys.readouterr().out == ""
 

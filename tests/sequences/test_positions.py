@@ -153,7 +153,7 @@ def test_places_that_fit_no_metres_beside_them_are_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "said"),
     [
         (
             table("time,lat,lon", S, LATITUDE[:1] * COUNT, LONGITUDE[:1] * COUNT),
@@ -163,11 +163,15 @@ def test_places_that_fit_no_metres_beside_them_are_asked_for(tmp_path):
         ('<?xml version="1.0"?><gpx></gpx>', "has no points of a track"),
         (re.sub("<time>.*?</time>", "", gpx()), "point 1 has no time: export the track with times"),
         (gpx()[:300], "broken XML"),
+        (
+            message(X, Y, ZERO, *QUATERNIONS).replace("1700000000,", "9900000000,"),
+            "s is too large for a time",
+        ),
         ("$GNRMC,130225.00,V,,,,,,,260911,,,N*53\n", "has no fix with a date"),
     ],
 )
-def test_a_file_without_a_course_or_times_is_one_line(text, message, tmp_path):
-    with pytest.raises(InputError, match=message):
+def test_a_file_without_a_course_or_times_is_one_line(text, said, tmp_path):
+    with pytest.raises(InputError, match=said):
         read(tmp_path, text)
 
 

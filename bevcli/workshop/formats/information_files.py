@@ -5,8 +5,6 @@ on, `images` with `cam2ego` and `cam2img`. Where only the lidar is named (`senso
 `lidar2img`), its pose on the vehicle (`lidar2ego`) is needed, or the rig is that of the lidar.
 """
 
-import io
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +14,17 @@ from scipy.linalg import rq
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
 from bevcli.parsing.documents import read_json
-from bevcli.parsing.files import MIB, open_regular, read_bytes
-from bevcli.printing import reason_of
+from bevcli.parsing.files import MIB, open_regular
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.workshop.formats.camera_poses import Cameras
 from bevcli.workshop.formats.named_calibration import cameras_of
+from bevcli.workshop.formats.plain_pickle import read_plain_pickle
 
 LARGEST_BYTES = 1024 * MIB
 PICKLES = (".pkl", ".pickle")
 LISTS = ("infos", "data_list")
 HEAD_BYTES = 4096  # of a JSON file, in which the name of a list stands
 SAME_M = 1e-3
-# What pickles of plain values and of NumPy's arrays call; nothing else is called.
-HARMLESS = {("_codecs", "encode"), ("collections", "OrderedDict"), ("numpy", "dtype"), ("numpy", "ndarray")} | {
-    (f"numpy.{core}.{module}", name)
-    for core in ("core", "_core")
-    for module, name in (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
-}
-
-
-class _Unpickler(pickle.Unpickler):
-    """An unpickler of plain values and arrays, which calls nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in HARMLESS:
-            raise pickle.UnpicklingError(f"it calls {module}.{name}, and was not read further")
-        return super().find_class(module, name)
 
 
 def is_information(path: Path) -> bool:
@@ -75,12 +58,7 @@ def read_information(path: Path) -> Cameras:
 
 
 def _document(path: Path) -> Any:
-    if path.suffix.lower() not in PICKLES:
-        return read_json(path, largest=LARGEST_BYTES)
-    try:
-        return _Unpickler(io.BytesIO(read_bytes(path, LARGEST_BYTES))).load()
-    except Exception as error:  # a damaged pickle fails in many ways
-        raise InputError(f"{path}: cannot be read as a pickle ({reason_of(error)[:200]})") from None
+    return read_plain_pickle(path) if path.suffix.lower() in PICKLES else read_json(path, largest=LARGEST_BYTES)
 
 
 def _differ(camera: dict[str, Any], other: dict[str, Any]) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.parsing.documents import CSV_BYTES
+from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER
 from bevcli.parsing.files import is_there, read_text
 from bevcli.workshop.formats.name_times import date_ns, scaled_ns
 
@@ -37,7 +37,7 @@ def read_times(file: Path) -> NDArray[np.int64]:
         if not (text := line.strip()):
             continue
         time = date_ns(text) if ":" in text else scaled_ns(text)
-        if time is None or (times and time <= times[-1]):
+        if time is None or abs(time) > LARGEST_INTEGER or (times and time <= times[-1]):
             raise InputError(f'{file}: line {number}: expected a later time in seconds, or a date, found "{text:.40}"')
         times.append(time)
     return np.array(times, dtype=np.int64)

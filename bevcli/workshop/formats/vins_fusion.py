@@ -38,7 +38,9 @@ def read_vins_fusion(path: Path) -> Cameras:
 
 
 def _cameras(main: Path) -> dict[str, Any]:
-    document, cameras = read_yaml(main), {}
+    document, cameras = read_yaml(main), dict[str, Any]()
+    if not isinstance(document, dict):
+        raise InputError(f"{main}: is no mapping (expected cam0_calib, body_T_cam0 and so on)")
     for key, name in document.items():
         if (match := CALIBRATION.fullmatch(str(key))) is not None:
             camera = read_yaml(main.parent / Path(str(name)).name)
