@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 
 from bevcli.config import as_table, config_of_table, load_config
 from bevcli.errors import ConfigError, InputError
@@ -29,15 +30,8 @@ def table(**changes) -> dict:
 
 
 def boxes(*names: str, scores: float | None = None) -> Boxes3D:
-    count = len(names)
-    return Boxes3D(
-        np.column_stack([10.0 + 8 * np.arange(count), np.zeros(count), np.ones(count)]),
-        np.full((count, 3), 2.0),
-        np.zeros(count),
-        np.full((count, 2), 3.0),
-        np.array(names),
-        None if scores is None else np.full(count, scores),
-    )
+    places = [(10.0 + 8 * place, 0.0, 1.0) for place in range(len(names))]
+    return made_boxes(places, names, sizes_lwh=2.0, velocities=3.0, scores=scores)
 
 
 def frames(names: tuple[str, ...], score: float | None = None) -> list[dict]:

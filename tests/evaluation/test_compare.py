@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
 from sequences.nuscenes_tables import Size, write_tables
 from test_eval_command import evaluated, write_frames
@@ -35,15 +36,7 @@ STREET = Path(__file__).parents[2] / "samples" / "street"
 
 def cars(places: list[float], scores: list[float] | None = None) -> Boxes3D:
     """Cars on the x axis."""
-    count = len(places)
-    return Boxes3D(
-        np.array([(x, 0.0, 0.0) for x in places]).reshape(-1, 3),
-        np.ones((count, 3)),
-        np.zeros(count),
-        np.zeros((count, 2)),
-        np.full(count, "car"),
-        None if scores is None else np.array(scores),
-    )
+    return made_boxes([(x, 0.0) for x in places], sizes_lwh=1.0, scores=scores)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
 
 from bevcli.geometry.boxes import Boxes3D
@@ -21,16 +22,7 @@ from bevcli.workshop.scores.evaluate import evaluate
 
 
 def cars(x: list[float], scores: list[float] | None = None, class_name: str = "car") -> Boxes3D:
-    count = len(x)
-    return Boxes3D(
-        centers=np.stack([np.array(x), np.zeros(count), np.zeros(count)], axis=-1),
-        sizes_lwh=np.tile([4.0, 2.0, 1.5], (count, 1)),
-        yaws=np.zeros(count),
-        velocities=np.zeros((count, 2)),
-        classes=np.repeat([class_name], count),
-        scores=None if scores is None else np.array(scores),
-        attributes=np.repeat(["vehicle.parked"], count),
-    )
+    return made_boxes([(each, 0.0) for each in x], class_name, scores=scores, attributes="vehicle.parked")
 
 
 def numbers(scores: DetectionScores) -> dict[str, float]:

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
 from typer.testing import CliRunner
 
@@ -181,21 +182,11 @@ def test_mistakes_are_named(tmp_path: Path, files: tuple[Path, Path]) -> None:
 
 
 def test_bicycles_in_a_bicycle_rack_are_left_out() -> None:
-    def at(places: list[tuple[float, float, float]], names: list[str]) -> Boxes3D:
-        count = len(names)
-        return Boxes3D(
-            np.array(places),
-            np.ones((count, 3)),
-            np.zeros(count),
-            np.zeros((count, 2)),
-            np.array(names),
-            np.ones(count),
-        )
-
-    rack = replace(at([(10.0, 0, 1)], ["static_object.bicycle_rack"]), sizes_lwh=np.array([[6.0, 2, 2]]))
-    rack = replace(rack, yaws=np.array([np.pi / 2]))  # along y
+    along_y = {"sizes_lwh": (6.0, 2.0, 2.0), "yaws": np.pi / 2}
+    rack = made_boxes([(10.0, 0, 1)], "static_object.bicycle_rack", scores=1.0, **along_y)
     places = [(10.0, 2.5, 1.0), (12.5, 0.0, 1.0), (10.0, -2.0, 1.0), (10.0, 0.0, 3.0), (10.0, 0.0, 1.0)]
-    boxes = at(places, ["bicycle", "bicycle", "motorcycle", "bicycle", "pedestrian"])
+    names = ["bicycle", "bicycle", "motorcycle", "bicycle", "pedestrian"]
+    boxes = made_boxes(places, names, sizes_lwh=1.0, scores=1.0)
     frame = FrameBoxes(FrameStamp(0, "s", 0), Pose.identity(), boxes, {"sample_token": "t"})
     file = BoxesFile("world", (frame,))
     pairs = without_cycles_in_racks(pair_frames(file, file), {"t": rack})

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
@@ -107,14 +108,7 @@ def test_every_box_in_view_has_a_label_with_its_2d_box() -> None:
 
 def test_a_box_straight_ahead_by_hand() -> None:
     level = Camera("C", 1600, 900, CAMERA.intrinsics, rigid((0, 0, 1.5), LOOKING_AHEAD))
-    box = Boxes3D(
-        np.array([[20.0, 2.0, 0.75]]),
-        np.array([[4.0, 2.0, 1.5]]),
-        np.array([0.0]),
-        np.zeros((1, 2)),
-        np.array(["car"]),
-    )
-    fields = kitti_labels(box, level)[0].split()
+    fields = kitti_labels(made_boxes([(20.0, 2.0, 0.75)]), level)[0].split()
     # Driving away: heading along the camera's z, which is rotation_y -90 degrees; 2 m to the left, on the ground.
     assert [float(value) for value in fields[8:]] == pytest.approx([1.5, 2, 4, -2, 1.5, 20, -np.pi / 2], abs=1e-3)
     assert float(fields[3]) == pytest.approx(-np.pi / 2 + np.arctan(0.1), abs=1e-3)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -113,13 +114,8 @@ def test_a_submission_is_valid_after_every_frame(tmp_path: Path) -> None:
     ],
 )
 def test_attributes_follow_from_class_and_speed(class_name: str, slow: str, fast: str) -> None:
-    boxes = Boxes3D(
-        np.zeros((3, 3)),
-        np.ones((3, 3)),
-        np.zeros(3),
-        np.array([[0.1, 0.17], [0.15, 0.15], [np.nan, np.nan]]),  # 0.197, 0.212 m/s, unknown
-        np.repeat([class_name], 3),
-    )
+    velocities = [[0.1, 0.17], [0.15, 0.15], [np.nan, np.nan]]  # 0.197, 0.212 m/s, unknown
+    boxes = made_boxes(np.zeros((3, 3)), class_name, velocities=velocities)
     assert attributes_by_speed(boxes).tolist() == [slow, fast, slow]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -88,16 +89,8 @@ def test_the_metrics_at_every_recall_level_equal_the_devkits(golden: dict[str, A
 
 
 def cars(rows: list[Row], score: float | None = None) -> Boxes3D:
-    count = len(rows)
-    return Boxes3D(
-        np.array([(x, y, 0) for _, x, y in rows], dtype=np.float64).reshape(-1, 3),
-        np.tile([4.0, 2.0, 1.5], (count, 1)),
-        np.zeros(count),
-        np.zeros((count, 2)),
-        np.full(count, "car"),
-        instances=np.array([name for name, _, _ in rows], dtype=np.str_),
-        track_scores=None if score is None else np.full(count, score),
-    )
+    names = np.array([name for name, _, _ in rows], dtype=np.str_)
+    return made_boxes([place for _, *place in rows], instances=names, track_scores=score)
 
 
 def car_scores(predicted: list[list[Row]], truth: list[list[Row]], scenes: str | None = None) -> TrackingScores:
@@ -264,15 +257,8 @@ def frame_boxes(rows):
         return Boxes3D.empty()
     numbers = np.array([number for number, _ in rows])
     centers = np.stack([numbers % 8 * 8.0 - 28, numbers // 8 * 8.0 - 28, np.zeros(len(rows))], axis=1)
-    return Boxes3D(
-        centers,
-        np.full((len(rows), 3), 2.0),
-        np.zeros(len(rows)),
-        np.zeros((len(rows), 2)),
-        np.full(len(rows), "car"),
-        instances=numbers.astype(str),
-        track_scores=np.array([score for _, score in rows]),
-    )
+    scores = [score for _, score in rows]
+    return made_boxes(centers, sizes_lwh=2.0, instances=numbers.astype(str), track_scores=scores)
 
 
 def devkit_levels(truth, found):

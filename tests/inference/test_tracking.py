@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -17,14 +18,7 @@ STANDING = (0.0, 0.0)
 
 
 def box(x, y, velocity=STANDING, score=0.9, name="car"):
-    return Boxes3D(
-        np.array([[x, y, 0.5]]),
-        np.array([[4.0, 2.0, 1.5]]),
-        np.zeros(1),
-        np.array([velocity], dtype=np.float64),
-        np.array([name]),
-        scores=np.array([score]),
-    )
+    return made_boxes([(x, y, 0.5)], name, velocities=np.array(velocity, dtype=np.float64), scores=score)
 
 
 def frame(*boxes):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from made_boxes import made_boxes
 from small_model import small_config
 
 from bevcli.geometry.boxes import Boxes3D
@@ -47,13 +48,7 @@ def test_decoding_undoes_encoding() -> None:
 
 
 def test_the_code_of_a_car_that_heads_along_y() -> None:
-    car = Boxes3D(
-        np.array([[1.0, 2, -1]]),
-        np.array([[4.5, 1.9, 1.6]]),
-        np.array([np.pi / 2]),
-        np.array([[0.0, 8]]),
-        np.array(["car"]),
-    )
+    car = made_boxes([(1.0, 2, -1)], sizes_lwh=(4.5, 1.9, 1.6), yaws=np.pi / 2, velocities=(0.0, 8.0))
     # The original's angle is -yaw - pi/2 = -pi: sine 0, cosine -1.
     expected = [1, 2, np.log(1.9), np.log(4.5), -1, np.log(1.6), 0, -1, 0, 8]
     np.testing.assert_allclose(encode(car)[0], expected, atol=1e-12)
@@ -84,13 +79,7 @@ def test_there_are_at_most_max_boxes_boxes(queries: int, expected: int) -> None:
 
 def scores_in_a_row(config: ModelConfig, x: list[float], logits: list[list[float]]) -> Array:
     """Scores of boxes 2 m wide at these x, in metres, by x and class. logits: (Q, classes)."""
-    boxes = Boxes3D(
-        np.array([[place, 0, 0] for place in x]),
-        np.full((len(x), 3), 2.0),
-        np.zeros(len(x)),
-        np.zeros((len(x), 2)),
-        np.full(len(x), "car"),
-    )
+    boxes = made_boxes([(place, 0.0) for place in x], sizes_lwh=2.0)
     decoded = outputs(np.array(logits), encode(boxes)).boxes(config)
     assert decoded.scores is not None
     assert (np.diff(decoded.scores) <= 0).all()

@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from made_boxes import made_boxes
 from memory_drive import MemoryDrive
 
 from bevcli.frame import Frame
-from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Distortion, camera_pose_noise
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, apply, inverse
@@ -38,13 +38,7 @@ class WithTruth(MemoryDrive):
 
     def load(self, index: int) -> Frame:
         self.loads += 1
-        car = Boxes3D(
-            np.array([[9.0, 2.0, 0.8]]),
-            np.array([[4.5, 2, 1.6]]),
-            np.array([0.3]),
-            np.array([[0.4, 0.1]]),
-            np.array(["car"]),
-        )
+        car = made_boxes([(9.0, 2.0, 0.8)], sizes_lwh=(4.5, 2.0, 1.6), yaws=0.3, velocities=(0.4, 0.1))
         return replace(super().load(index), ground_truth=car)
 
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from made_boxes import made_boxes
 from one_image import ImageTargets, objects_of_image, targets_of_image
 
 from bevcli.errors import InputError
@@ -33,8 +34,7 @@ def image_from_bev(camera_from_bev: np.ndarray = CAMERA_FROM_BEV, intrinsics: np
 def boxes(*rows: tuple[float, ...]) -> Boxes3D:
     """x, y, z, length, width, height, yaw of each."""
     table = np.array(rows, dtype=float).reshape(-1, 7)
-    names = np.full(len(table), "car")
-    return Boxes3D(table[:, :3], table[:, 3:6], table[:, 6], np.zeros((len(table), 2)), names)
+    return made_boxes(table[:, :3], sizes_lwh=table[:, 3:6], yaws=table[:, 6])
 
 
 def truth(*rows: tuple[float, ...]) -> DetectionTargets:
@@ -214,15 +214,7 @@ GRID = BevGrid(4, 8, x_range_m=(-8, 8), y_range_m=(-4, 4))  # cells of 2 m
 def classed_boxes(*rows: tuple[str, float, float, float], num_points: list[int] | None = None) -> Boxes3D:
     """Rows of class, x, y, yaw; 4 m long, 2 m wide."""
     names, xs, ys, yaws = zip(*rows, strict=True)
-    count = len(rows)
-    return Boxes3D(
-        centers=np.stack([xs, ys, np.zeros(count)], -1).astype(float),
-        sizes_lwh=np.tile([4.0, 2.0, 1.5], (count, 1)),
-        yaws=np.array(yaws, dtype=float),
-        velocities=np.zeros((count, 2)),
-        classes=np.array(names),
-        num_points=None if num_points is None else np.array(num_points),
-    )
+    return made_boxes(np.stack([xs, ys], -1), names, yaws=np.array(yaws, dtype=float), num_points=num_points)
 
 
 def test_boxes_out_of_range_class_or_points_are_no_targets(mini_config) -> None:
