@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -122,6 +123,7 @@ class Session:
         self._meter: Any = None  # of a session without poses
         self._drive = 1
         self._last_ns: int | None = None
+        self._stepping = Lock()
 
     @property
     def motion(self) -> Any:
@@ -157,9 +159,28 @@ class Session:
             command: of the driver, from this frame on. Default: the one before.
 
         Raises InputError for an unknown camera or command, an image of another size or type, a pose that is not rigid,
-        poses for some frames only, and a time that is not later than the one before. The session is then as it was
-        before the call.
+        poses for some frames only, a time that is not later than the one before, and a call while another thread is in
+        a step. The session is then as it was before the call.
         """
+        if not self._stepping.acquire(blocking=False):
+            raise InputError(
+                "another thread is in a step of this session: call `step` from one thread, or make a session for each "
+                "vehicle"
+            )
+        try:
+            return self._step(images, world_from_ego, timestamp_ns, world_from_ego_at, kinematics, command)
+        finally:
+            self._stepping.release()
+
+    def _step(
+        self,
+        images: Mapping[str, NDArray[Any]],
+        world_from_ego: Pose | ArrayLike | None,
+        timestamp_ns: int,
+        world_from_ego_at: Mapping[str, Pose | ArrayLike] | None,
+        kinematics: Kinematics | None,
+        command: str | None,
+    ) -> Prediction:
         stamp = self._next_stamp(timestamp_ns)
         self._check_all_or_none(world_from_ego is None, world_from_ego_at)
         pose = Pose.identity() if world_from_ego is None else _pose(world_from_ego, "`world_from_ego`")

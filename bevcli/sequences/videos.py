@@ -1,6 +1,7 @@
 """Videos, whose images are read by index. Whatever a container states, an image has the pixels that are stored."""
 
 import contextlib
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -36,7 +37,7 @@ class VideoReader:
         Raises InputError if the file is missing, is not a video, or does not have the image.
         """
         if self._end is not None and index >= self._end:
-            raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
+            raise self._without(index)
         if self._capture is None or index < self._at:
             self._capture, self._at, self._pixels = open_capture(self.path), -1, None
         if index == self._at and self._pixels is not None:
@@ -47,7 +48,7 @@ class VideoReader:
                 grabbed = self._capture.grab()
             if not grabbed:
                 self._end, self._capture = self._at + 1, None
-                raise InputError(f"{self.path} has no image {index} (the last is {self._end - 1})")
+                raise self._without(index)
             self._at += 1
         with contextlib.suppress(cv2.error):
             readable, pixels = self._capture.retrieve()
@@ -55,6 +56,10 @@ class VideoReader:
                 self._pixels = pixels.astype(np.uint8, copy=False)
                 return self._pixels
         raise InputError(f"{self.path}: image {index} cannot be decoded")
+
+    def _without(self, index: int) -> InputError:
+        last = f"the last is {self._end - 1}" if self._end else "none can be decoded, the file is damaged"
+        return InputError(f"{self.path} has no image {index} ({last})")
 
 
 def open_capture(path: Path) -> cv2.VideoCapture:
@@ -64,13 +69,20 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     # FFmpeg recognises playlists too, which could lead it to other files and to servers.
     if not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM or AVI)")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing: what fails here is told in one line
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         with plain_name(path) as name:
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     except cv2.error:
         capture = cv2.VideoCapture()
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
-        raise InputError(f"{path} cannot be opened as a video (expected a codec such as H.264 or FFV1)")
+        raise InputError(
+            f"{path} cannot be opened as a video: it is cut short, has sound only, or a codec that is not read "
+            "(expected one such as H.264 or FFV1)"
+        )
     # The calibration is that of the pixels as they are stored, and versions of OpenCV differ in whether they turn them.
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     width, height = (capture.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

@@ -1,5 +1,7 @@
 """A session, and a model called with one frame: they give what a run gives, and what they refuse."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -214,3 +216,41 @@ def test_objects_of_the_api_are_described_in_one_line(model, images):
         "MemoryDrive(memory, 1 frame, 6 cameras)": DRIVE,
     }
     assert {repr(each) for each in described.values()} == described.keys()
+
+
+def test_a_step_during_the_step_of_another_thread_is_refused(model, monkeypatch):
+    drive = MemoryDrive(2, make_rig({"CAM_FRONT": 0.0}))
+    session, refused = bevcli.Session(model, drive.rig), []
+    prepare = session._runner.prepare
+
+    def meanwhile(frame):
+        def other():
+            with pytest.raises(InputError, match="another thread is in a step of this session"):
+                step(session, drive.load(0))
+            refused.append(True)
+
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        return prepare(frame)
+
+    monkeypatch.setattr(session._runner, "prepare", meanwhile)
+    step(session, drive.load(0))
+    assert refused == [True]
+    monkeypatch.setattr(session._runner, "prepare", prepare)
+    step(session, drive.load(1))
+
+
+def test_sessions_of_several_threads_give_the_results_of_one(model):
+    drive = MemoryDrive(3, make_rig({"CAM_FRONT": 0.0, "CAM_BACK": np.pi}))
+    frames = [drive.load(place) for place in range(3)]
+
+    def through(_):
+        session = bevcli.Session(model, drive.rig)
+        return [step(session, frame) for frame in frames]
+
+    expected = through(0)
+    with ThreadPoolExecutor(3) as pool:
+        for found in pool.map(through, range(3)):
+            for one, other in zip(expected, found, strict=True):
+                assert_same(one, other)

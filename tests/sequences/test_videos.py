@@ -202,3 +202,23 @@ def test_videos_alone_may_do_without_poses(tmp_path):
     (tmp_path / "calibration.json").touch()
     assert not holds_videos_alone(tmp_path)
     assert not holds_videos_alone(tmp_path / "videos")
+
+
+@pytest.mark.parametrize("damage", ["audio only", "cut", "no video"])
+def test_a_video_without_images_is_one_line(tmp_path, capfd, damage):
+    """What OpenCV prints itself is not seen."""
+    path = tmp_path / "v.mp4"
+    if damage == "audio only":
+        av = pytest.importorskip("av")
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("aac", rate=44100, layout="mono")
+            frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            frame.sample_rate = 44100
+            container.mux([*stream.encode(frame), *stream.encode(None)])
+    else:
+        write_video(path, [image_of("CAM_FRONT", n) for n in range(10)], 10, "mp4v")
+        content = path.read_bytes()
+        path.write_bytes(content[: content.index(b"mdat") + 8] if damage == "cut" else content[:8] + bytes(2000))
+    with pytest.raises(InputError, match=r"v.mp4 cannot be opened as a video: it is cut short, has sound only"):
+        VideoReader(path).read(0)
+    assert "VIDEOIO" not in capfd.readouterr().err
