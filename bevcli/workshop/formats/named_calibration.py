@@ -129,7 +129,7 @@ def cameras_of(document: Any, path: Path) -> Cameras:
     entries = _value(document, "cameras", "sensors", "cameracalibrations")
     if isinstance(entries, list):
         names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")
-                 if isinstance(entry, dict) else "" for index, entry in enumerate(entries)]  # fmt: skip
+                 if isinstance(entry, dict) else f"{index}" for index, entry in enumerate(entries)]  # fmt: skip
         for name in (name for index, name in enumerate(names) if name in names[:index]):
             raise InputError(f"{path}: camera {name} is in the list twice: keep one")
         entries = dict(zip(names, entries, strict=True))
