@@ -289,3 +289,31 @@ def test_the_folder_of_euroc(tmp_path):
     written(tmp_path, {"sensor_type": "imu", "rate_hz": 200}, "mav0/imu0/sensor.yaml")
     found = read(tmp_path / "mav0", None)
     assert_is_the_street(found.rig, [f"cam{index}" for index in range(len(NAMES))], lens=True)
+
+
+@pytest.mark.parametrize("layout", ["agent", "objects.json"])
+def test_the_sensors_of_carla(tmp_path, layout):
+    """In an agent y is right and a positive yaw looks to the right; the ROS bridge has ROS's axes."""
+    is_ros, sensors = (
+        layout == "objects.json",
+        [{"type": "sensor.lidar.ray_cast", "id": "lidar", "x": 0, "y": 0, "z": 2}],
+    )
+    for name in NAMES:
+        place = {key: np.degrees(value) if key in ("roll", "pitch", "yaw") else value
+                 for key, value in frame(pose(name, axes=VEHICLE)).items()}  # fmt: skip
+        sides = ("y", "pitch", "yaw")
+        place = {key: value if is_ros or key not in sides else -value for key, value in place.items()}
+        fov = float(np.degrees(2 * np.arctan(SIZE[0] / 2 / k_of(name)[0, 0])))
+        facts = {"type": "sensor.camera.rgb", "id": name, "fov": fov}
+        size = dict(zip(("image_size_x", "image_size_y") if is_ros else ("width", "height"), SIZE, strict=True))
+        sensors.append({**facts, **size, **({"spawn_point": place} if is_ros else place)})
+    document = {"objects": [{"type": "vehicle.tesla.model3", "id": "ego", "sensors": sensors}]} if is_ros else sensors
+    found = read(written(tmp_path, document, "objects.json"), None)
+    assert sorted(found.rig.names) == sorted(NAMES)
+    for name in NAMES:
+        np.testing.assert_allclose(found.rig[name].ego_from_camera, pose(name), atol=1e-6)
+        np.testing.assert_allclose(found.rig[name].intrinsics[:2, :2], k_of(name)[:2, :2], rtol=1e-6)
+        np.testing.assert_allclose(found.rig[name].intrinsics[:2, 2], (np.array(SIZE) - 1) / 2)
+    sensors[1]["fov"] = "wide"
+    with pytest.raises(InputError, match=f"camera {NAMES[0]}: expected numbers for x, y, z, roll, pitch, yaw"):
+        read(written(tmp_path, document, "objects.json"), None)

@@ -22,6 +22,7 @@ from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
 from bevcli.workshop.formats.autoware import urdf_document, with_own_names
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
+from bevcli.workshop.formats.carla import with_sensors_by_name
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
 from bevcli.workshop.formats.orb_slam import with_cameras_apart
 from bevcli.workshop.formats.pose_readings import quaternions_of_angles
@@ -119,7 +120,7 @@ def number_of(word: str) -> float | None:
 
 def cameras_of(document: Any, path: Path) -> Cameras:
     """The cameras of a document with their K, D and T by name. Raises InputError, which names `path`."""
-    document = with_own_names(document, path)
+    document = with_sensors_by_name(with_own_names(document, path), path)
     expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
     if isinstance(document, list):
         document = {"cameras": document}
