@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import fsspec
@@ -45,6 +46,12 @@ def fleet(tmp_path_factory):
 def model(fleet):
     """The model of the fleet, with random weights."""
     return make_job(fleet / "out", fleet / "mini.toml").load_model()
+
+
+@pytest.fixture(autouse=True)
+def witness(monkeypatch):
+    """A witness that sees nothing, at once."""
+    monkeypatch.setattr("bevcli.workshop.trust.estimate.load_witness", lambda: SimpleNamespace(seen=lambda frame: {}))
 
 
 @pytest.fixture
@@ -96,6 +103,14 @@ def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, m
     with (tmp_path / "out/batch.csv").open() as file:
         assert [row["drive"] for row in csv.DictReader(file)] == ["d000", "d001", "d002", "empty"]
     assert not list((tmp_path / "out/.bevcli/attempts").iterdir())
+
+
+def test_drives_that_are_not_scored_have_their_agreement(batch, tmp_path, monkeypatch):
+    found = SimpleNamespace(score=0.51234, low=0.4, high=None)
+    monkeypatch.setattr(worker_module, "agreement_of_run", lambda folder, drive: found)
+    batch()
+    row = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()[0]
+    assert (row["agreement"], row["agreement_low"], row["agreement_high"]) == (0.5123, 0.4, None)
 
 
 def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
