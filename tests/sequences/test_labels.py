@@ -170,6 +170,7 @@ def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
         ("x 1 Car", "line 1: expected the index of a frame and a track"),
         ("0 1 Car 0 0", "line 1: expected 15 or 16 words from the type on"),
         ("0 1 Car 0 0 0 0 0 9 9 1 2 4 nan 1 20 0", "finite numbers"),
+        ("0 1 Car 0 0 0 0 0 9 9 1 2 4 1 1 20 -90", "rotation_y is -90 .expected radians"),
     ],
 )
 def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
