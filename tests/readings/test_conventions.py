@@ -1,5 +1,6 @@
 """A true drive in the conventions of other programs is read right, or a question names the options that decide."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -54,3 +55,15 @@ def test_of_a_vehicle_that_stands_both_sides_tell(street, tmp_path):
     found = opened(tmp_path, options)
     assert "cameras are alike on both sides" in " ".join(found.notes)
     assert found.rig["cam0"].yaw == pytest.approx(street.rig.cameras[0].yaw, abs=1e-6)
+
+
+def test_what_is_stated_is_believed_and_a_note_says_what_fits(street, tmp_path):
+    options = write(street, tmp_path, Convention(rig_axes="rfu", transform="T"))
+    stated = {"pose_axes": "flu", "pose_transform": "body_from_world"}
+    found = opened(tmp_path, options, **stated)
+    assert re.search(
+        r"does not fit the images \(residual .* they fit `--pose-transform world_from_body", found.notes[-1]
+    )
+    assert "does not fit" not in " ".join(opened(tmp_path, options, **stated | {"pose_transform": None}).notes)
+    with pytest.raises(InputError, match=r"has .* readings.* they fit `--pose-transform world_from_body"):
+        opened(tmp_path, options, pose_transform="body_from_world")

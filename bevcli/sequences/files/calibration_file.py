@@ -28,6 +28,7 @@ from bevcli.writing import write_whole
 FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 LARGEST_JSON = 64 << 20  # of another program, such as that of a reconstruction
+CONTRADICTED = "images-contradict"  # code of a finding about what the user states
 RIG_STATEMENTS = ("transform", "rig_axes", "camera_axes", "rig_angles", "rig_unit")  # options of what transforms are
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LONGEST_NAME = 60  # characters of a wrong name in a message
@@ -53,6 +54,7 @@ class RigDraft:
         facts: what the file states about the drive.
         readings: what the poses in a file of another program may be, the rig being the first; empty where they are
             certain.
+        others: readings that contradict what the user states.
         file: of the poses.
     """
 
@@ -60,12 +62,14 @@ class RigDraft:
     findings: tuple[Finding, ...]
     facts: DriveFacts = field(default_factory=DriveFacts)
     readings: tuple[RigReading, ...] = ()
+    others: tuple[RigReading, ...] = ()
     file: Path = Path()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """How the file was understood, if it is no calibration.json."""
-        return tuple(finding.line for finding in self.findings if finding.severity == "info")
+        told = (each for each in self.findings if each.severity == "info" or each.code == CONTRADICTED)
+        return tuple(finding.line for finding in told)
 
     def checked(self, path: Path) -> "RigDraft":
         """The draft itself. Raises InputError with its first mistake. path: the file."""

@@ -63,6 +63,7 @@ class ReadPoses:
         notes: for the user, such as how the file was read.
         geo_origin: the place of their world frame on Earth, where the file says it.
         readings: what the poses of another program may be, the motion being the first; empty where they are certain.
+        others: readings that contradict what the user states.
         file: of the poses.
     """
 
@@ -70,6 +71,7 @@ class ReadPoses:
     notes: tuple[str, ...] = ()
     geo_origin: GeoOrigin | None = None
     readings: tuple[PoseReading, ...] = ()
+    others: tuple[PoseReading, ...] = ()
     file: Path = Path()
 
 

@@ -115,7 +115,8 @@ def read_rig(
     if is_open := [name for name in used if cameras[name].lens_is_open]:
         findings.append(Finding("lens-assumed", "info", None, OPEN_LENS.format(calibration.name, ", ".join(is_open))))
     readings = readings if readings[0].states else ()
-    return RigDraft(camera_rig, tuple(findings), readings=readings, file=where)
+    others = _readings(where, posed, {}, height, yaw_deg)[0] if stated else ()
+    return RigDraft(camera_rig, tuple(findings), readings=readings, others=others, file=where)
 
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:

@@ -28,6 +28,7 @@ from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
 from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.native import TimeKind
+from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.oxts import read_oxts
 from bevcli.workshop.formats.pose_readings import (
@@ -44,6 +45,7 @@ from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 _DIGITS = re.compile(r"(\d{1,18})(?:\.(\d{0,18}))?", re.ASCII)  # a time with all of its digits
+POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles")
 ANGLES = ("radians", "degrees", "compass", "compass-radians")
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
@@ -94,6 +96,9 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
         raise InputError(f"{path}: line {line}: its time is not later than that of the row before: sort them")
     _check_camera(drive)
     readings = list(_readings(table, positions, KINDS[name], drive, times))
+    is_stated = any(getattr(drive.stated, option) for option in POSE_STATEMENTS)
+    free = replace(drive, stated=RigOptions())
+    others = tuple(_readings(table, positions, KINDS[name], free, times)) if is_stated else ()
     if not readings:
         raise InputError(
             f"{path}: in no reading of the poses the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
@@ -109,7 +114,8 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
         count = len(drive.times_ns)
         last = f"; cover {'all' if covered == count else f'{covered} of {count}'} frames"
     readings = [replace(each, note=f"poses: {first}, {each.words()}{last}") for each in readings]
-    return replace(of_reading(readings[0], times, drive.rig), geo_origin=origin, readings=tuple(readings), file=path)
+    read = of_reading(readings[0], times, drive.rig)
+    return replace(read, geo_origin=origin, readings=tuple(readings), others=others, file=path)
 
 
 def of_reading(reading: PoseReading, times_ns: NDArray[np.int64], rig: CameraRig) -> ReadPoses:
@@ -289,7 +295,7 @@ def _readings(
 ) -> Iterator[PoseReading]:
     """What the poses may be, the usual first: those of KITTI are of its camera 0."""
     rotations, cameras = _rotations(table, drive), list(drive.rig.names)
-    stated = {name: getattr(drive.stated, name) for name in ("poses_of", "pose_axes", "pose_transform")}
+    stated = {name: getattr(drive.stated, name) for name in POSE_STATEMENTS[:3]}
     if stated["pose_axes"] is not None:
         stated["poses_of"] = "vehicle"
     of_gps = table.has("latitude", "longitude")

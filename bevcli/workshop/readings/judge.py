@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
+from bevcli.findings import Finding
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.options import named
-from bevcli.sequences.files.calibration_file import RigDraft
+from bevcli.sequences.files.calibration_file import CONTRADICTED, RigDraft
 from bevcli.sequences.files.ego_motion_file import ReadPoses
 from bevcli.sequences.files.readings import PoseReading, Reading, RigReading, differing, question
 from bevcli.sequences.images import ListedDrive
@@ -28,6 +29,7 @@ from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
 SOUND_PX = 2.5  # largest residual of a reading that is believed, reduced pixels
 CLEAR, CLEAR_PX = 2.0, 0.5  # factor and addition, by which the residuals of all others are larger
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
+CONTRADICTING = 3.0  # the same factor, of what is stated
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
@@ -106,6 +108,11 @@ def decide(draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOp
         read = of_reading(chosen.poses, poses.motion.timestamps_ns, draft.rig)
         notes = tuple(f"{note} ({evidence})" if evidence and chosen.rig is None else note for note in read.notes)
         poses = replace(poses, motion=read.motion, notes=notes, readings=())
+    if contradiction := judged.contradiction(chosen):
+        if draft.others:
+            draft = replace(draft, findings=(*draft.findings, Finding(CONTRADICTED, "warning", None, contradiction)))
+        else:
+            poses = replace(poses, notes=(*poses.notes, contradiction))
     return draft, poses
 
 
@@ -130,7 +137,7 @@ class _Judged:
 
     def _frames(self) -> list[tuple[int, int]]:
         """The pairs of frames that are compared."""
-        tracks = list(self._tracks().values())
+        tracks = list(_tracks(self._poses).values())
         if not tracks:
             return timed_pairs(self._times)
         at = [track.at(self._times)[0] for track in tracks]
@@ -141,31 +148,15 @@ class _Judged:
             self._times, *(np.concatenate([[0], np.cumsum(each)]) for each in (np.min(ways, axis=0), turned))
         )
 
-    def _tracks(self) -> dict[int, Poses]:
-        """The poses by the index of their reading."""
-        motion = self._poses.motion
-        if motion is None:
-            return {}
-        if not self._poses.readings:
-            return {0: Poses.of(motion)}
-        return {
-            index: Poses(
-                motion.timestamps_ns,
-                Rotation.from_quat(np.roll(each.quaternions, -1, axis=1)).as_matrix(),
-                each.translations,
-            )
-            for index, each in enumerate(self._poses.readings)
-        }
-
-    def candidates(self) -> Iterator[Candidate]:
+    def candidates(self, draft: RigDraft, poses: ReadPoses) -> Iterator[Candidate]:
         """All possible pairs of readings, those of the usual rig first."""
-        rigs: list[RigReading | None] = list(self._draft.readings) or [None]
-        readings: list[PoseReading | None] = list(self._poses.readings) or [None]
+        rigs: list[RigReading | None] = list(draft.readings) or [None]
+        readings: list[PoseReading | None] = list(poses.readings) or [None]
         at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64).reshape(-1, 2)
         short, nothing = self._short_steps(), np.zeros((0, 4, 4))
         motions = {
             index: (body_motions(track.at(at)[0]), body_motions(track.at(short)[0]))
-            for index, track in self._tracks().items()
+            for index, track in _tracks(poses).items()
         }
         for rig, (index, reading) in product(rigs, enumerate(readings)):
             stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
@@ -191,7 +182,7 @@ class _Judged:
 
     def chosen(self) -> tuple[Candidate, str]:
         """The candidate that the images show, and the evidence in words. Raises InputError."""
-        found = sorted(self.candidates(), key=lambda each: each.residual_px)
+        found = sorted(self.candidates(self._draft, self._poses), key=lambda each: each.residual_px)
         if not found:
             options = ", ".join(named(RigOptions, name) for name in ("rig_axes", "pose_axes", "poses_of"))
             raise InputError(
@@ -200,11 +191,13 @@ class _Judged:
             )
         best = found[0]
         left = [each for each in found if each.residual_px <= CLEAR * best.residual_px + CLEAR_PX]
-        if best.residual_px > SOUND_PX or len(self._pairs) < FEWEST_PAIRS:
-            left = [each for each in found if each.is_forward] or found
+        unsound = best.residual_px > SOUND_PX or len(self._pairs) < FEWEST_PAIRS
+        alike = left = found if unsound else left
         left = [each for index, each in enumerate(left) if not any(each.is_like(other) for other in left[:index])]
+        if unsound and differing([each.whole for each in left]) == ["pose_transform"]:
+            left = [each for each in left if each.is_forward] or left
         if len(left) > 1:
-            return self._on_both_sides(left)
+            return self._on_both_sides(left, alike)
         others = [each for each in found if not each.is_like(left[0])]
         if not others or not np.isfinite(best.residual_px):
             return left[0], ""
@@ -212,7 +205,22 @@ class _Judged:
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
 
-    def _on_both_sides(self, left: Sequence[Candidate]) -> tuple[Candidate, str]:
+    def contradiction(self, chosen: Candidate) -> str:
+        """The reading that fits the images where what is stated does not, as options; "" for none."""
+        if not (self._draft.others or self._poses.others) or len(self._pairs) < FEWEST_PAIRS:
+            return ""
+        draft = replace(self._draft, readings=self._draft.others or self._draft.readings)
+        poses = replace(self._poses, readings=self._poses.others or self._poses.readings)
+        fitting = min(self.candidates(draft, poses), key=lambda each: each.residual_px, default=chosen)
+        if fitting.residual_px > SOUND_PX or chosen.residual_px < CONTRADICTING * fitting.residual_px + CLEAR_PX:
+            return ""
+        flags = fitting.whole.flags(differing([chosen.whole, fitting.whole]))
+        return (
+            f"what is stated does not fit the images (residual {chosen.residual_px:.1f} px): they fit `{flags}` "
+            f"({fitting.residual_px:.1f} px)"
+        )
+
+    def _on_both_sides(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> tuple[Candidate, str]:
         """The one of several axes of a rig in which most cameras have one like them on the other side of the vehicle.
 
         Raises InputError where more than these axes are open, or several are alike in this.
@@ -221,14 +229,14 @@ class _Judged:
         most = max(counts)
         are_axes = differing([each.whole for each in left]) == ["rig_axes"] and self._options.image_check
         if not are_axes or counts.count(most) > 1:
-            raise self._question(left)
+            raise self._question(left, alike)
         chosen = left[counts.index(most)]
         others = [f"with {each.whole.flags(['rig_axes'])} {count}"
                   for each, count in zip(left, counts, strict=True) if each is not chosen]  # fmt: skip
-        alike = f"{most} of {len(self._draft.readings[0].ego_from_camera)} cameras are alike on both sides"
-        return chosen, f"the images do not tell; {alike}, {', '.join(others)}"
+        text = f"{most} of {len(self._draft.readings[0].ego_from_camera)} cameras are alike on both sides"
+        return chosen, f"the images do not tell; {text}, {', '.join(others)}"
 
-    def _question(self, left: Sequence[Candidate]) -> InputError:
+    def _question(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> InputError:
         """The error that names the readings left, and the options that decide."""
         wholes = [each.whole for each in left]
         why = "the images do not tell which it is"
@@ -238,7 +246,8 @@ class _Judged:
             why += " (the vehicle does not move, or they show too little)"
         else:
             why += f" (residuals {left[0].residual_px:.1f} px, {left[1].residual_px:.1f} px)"
-        return question(self._files(differing(wholes)), why, wholes)
+            why += f"; {contradiction}" if (contradiction := self.contradiction(left[0])) else ""
+        return question(self._files(differing(wholes)), why, wholes, [each.whole for each in alike])
 
     def _files(self, names: Sequence[str]) -> str:
         """The files that options state."""
@@ -272,6 +281,23 @@ class _Judged:
             up,
             f"; raised by {up:.2f} m, as the images show the cameras {np.mean(heights) + up:.2f} m above the road",
         )
+
+
+def _tracks(poses: ReadPoses) -> dict[int, Poses]:
+    """The poses by the index of their reading."""
+    motion = poses.motion
+    if motion is None:
+        return {}
+    if not poses.readings:
+        return {0: Poses.of(motion)}
+    return {
+        index: Poses(
+            motion.timestamps_ns,
+            Rotation.from_quat(np.roll(each.quaternions, -1, axis=1)).as_matrix(),
+            each.translations,
+        )
+        for index, each in enumerate(poses.readings)
+    }
 
 
 def _is_possible(way: Array, times_ns: NDArray[np.int64]) -> bool:
