@@ -176,6 +176,7 @@ PAGE = (ROOT / "docs" / "python.md").read_text()
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.slow  # test_readme.py and the tests of each function run its calls
 def test_the_examples_run(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(EXAMPLES) > 8
     with contextlib.chdir(clone):

@@ -57,6 +57,7 @@ def test_without_a_writable_place_the_cache_is_a_private_folder(read_only, tmp_p
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
+@pytest.mark.slow
 def test_a_temporary_folder_that_others_can_write_is_not_used(read_only, tmp_path):
     shared = tmp_path / "temporary" / f"bevcli-numba-{os.getuid()}"
     shared.mkdir(parents=True)

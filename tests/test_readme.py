@@ -5,7 +5,6 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
 from command_line import command
 
 from bevcli.published import read_sources
@@ -38,7 +37,6 @@ def test_how_far_official_weights_are_tested_is_said_once() -> None:
     assert "(docs/weights.md#what-was-verified)" in claim
 
 
-@pytest.mark.slow  # test_documents.py runs the same calls
 def test_the_python_example_writes_a_recording(clone: Path) -> None:
     [example] = blocks("python")
     with contextlib.chdir(clone):

@@ -247,6 +247,7 @@ def test_vads_lines_futures_and_paths_are_counted():
     assert backbone + own_attention < found < 1.5 * backbone
 
 
+@pytest.mark.slow
 def test_the_segmentation_head_is_counted():
     """Its products with every BEV cell: five projections, and two layers of attention and of masks."""
     config = load_config("demo")

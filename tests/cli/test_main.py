@@ -199,7 +199,7 @@ NAME_OF_300 = "x" * 300
         ("run", SAMPLE, "--out", NAME_OF_300, "--frames", "0:1"),
         ("convert", SAMPLE, NAME_OF_300),
         ("project-debug", SAMPLE, "--no-motion", "--out", NAME_OF_300),
-        ("render", NAME_OF_300),
+        pytest.param(("render", NAME_OF_300), marks=pytest.mark.slow),
     ],
     ids=lambda arguments: arguments[0],
 )

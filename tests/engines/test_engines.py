@@ -90,7 +90,7 @@ def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, monkey
     assert exported.decode("outputs") == (exported, "outputs", decoded)
 
 
-@pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
+@pytest.mark.parametrize("engine", ["onnxruntime", pytest.param("openvino", marks=pytest.mark.slow)])
 def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"
     exact, rounded = (load_exported(file, engine) for file in (small_file, int8_file))
