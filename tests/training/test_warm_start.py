@@ -135,6 +135,16 @@ def test_weights_of_another_network_are_refused(source: Path) -> None:
     assert all(torch.equal(tensor, before[key]) for key, tensor in model.state_dict().items())
 
 
+def test_weights_with_another_backbone_are_refused_unless_asked_for(source: Path) -> None:
+    model = own_model(backbone=replace(small_config().backbone, width=small_config().backbone.width * 2))
+    with pytest.raises(
+        WeightsError, match=r"source\.safetensors: its backbone does not fit that of own\.toml.*--preset"
+    ):
+        warm_start(source, model, "own.toml", NO_RIG)
+    with pytest.raises(WeightsError, match=r"holds \d+% of the numbers"):  # most of so small a model is its backbone
+        warm_start(source, model, "own.toml", NO_RIG, another_backbone=True)
+
+
 def test_a_file_without_names_keeps_the_order_of_its_rows(tmp_path: Path) -> None:
     path = tmp_path / "bare.safetensors"
     given = small_model(1).state_dict()

@@ -304,7 +304,8 @@ def prepare_training(
     torch.manual_seed(options.seed)
     model, started = build_network(model_config), []
     if options.weights is not None and not options.resume:
-        started += [warm_start(weights_file(options.weights), model, model_name_or_file, drives)]
+        file, another = weights_file(options.weights), options.backbone_weights is not None
+        started += [warm_start(file, model, model_name_or_file, drives, another_backbone=another)]
     if options.backbone_weights is not None and not options.resume:
         backbone, about = start_backbone(weights_file(options.backbone_weights), model, model_name_or_file)
         started, notes = [*started, backbone], (*notes, *about)

@@ -152,6 +152,7 @@ _ONE_CLIP: Changes = {"training.clips": {"batch": 1}}  # as published, on each o
 # The known model whose file a preset starts from, and the changes.
 PRESETS: Mapping[Preset, tuple[str, Changes]] = {
     "quick": ("demo", _QUICK),
+    "photographs": ("photographs", {table: changes for table, changes in _QUICK.items() if table != "image"}),
     "demo": ("demo", {}),
     "tiny": ("tiny", _ONE_CLIP),
     "base": ("base", _ONE_CLIP),

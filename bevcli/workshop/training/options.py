@@ -9,7 +9,7 @@ from bevcli.options import option, options, parse_pairs
 from bevcli.workshop.scores.options import MAX_RANGE_HELP
 
 Log = Literal["tensorboard"]
-Preset = Literal["quick", "demo", "tiny", "base"]
+Preset = Literal["quick", "photographs", "demo", "tiny", "base"]
 
 
 @options()
@@ -73,7 +73,7 @@ class ModelFileOptions:
     preset: Preset | None = option(
         default=None,
         help="The model that the file of --init starts from. quick, the default, is the demo model on smaller images, "
-        "for a CPU.",
+        "for a CPU; photographs is the model for real images.",
     )
 
 

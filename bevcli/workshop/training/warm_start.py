@@ -49,9 +49,10 @@ class WarmStart:
             before, first = self.rows.get((state, part, reason), (0, example))
             self.rows[state, part, reason] = before + numbers, first
 
-    def numbers(self, state: State) -> int:
-        """How many numbers are in a state."""
-        return sum(count for (counted, *_), (count, _) in self.rows.items() if counted == state)
+    def numbers(self, state: State, of_part: str = "") -> int:
+        """How many numbers are in a state, of all parts or of one."""
+        rows = ((part, count) for (counted, part, _), (count, _) in self.rows.items() if counted == state)
+        return sum(count for part, count in rows if of_part in ("", part))
 
     @property
     def share(self) -> float:
@@ -119,7 +120,9 @@ class NamedRows:
         return ", ".join(texts) + (self.remark if renamed else "")
 
 
-def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> WarmStart:
+def warm_start(
+    file: Path, model: Network, model_file: str, drives: Drives, *, another_backbone: bool = False
+) -> WarmStart:
     """Load, in place, every tensor of a weights file that fits a model; the others keep the model's initial values.
 
     `named_rows` says which rows of classes and cameras are taken. BEV queries of another number of cells over the same
@@ -130,8 +133,9 @@ def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> W
         model: unchanged where the file holds too little of it.
         model_file: name or TOML file of the model, for the messages.
         drives: to train on, whose first gives the cameras where their names differ.
+        another_backbone: the file may have another backbone than the model.
 
-    Raises WeightsError for a file that cannot be read, or with less than `LEAST_SHARE` of the model's numbers.
+    Raises WeightsError for a file that cannot be read, has another backbone, or less than `LEAST_SHARE` of the numbers.
     """
     checkpoint = read_checkpoint(file)
     start = WarmStart(file, checkpoint.facts.get("model") or " or ".join(checkpoint.models), model_file)
@@ -154,8 +158,14 @@ def warm_start(file: Path, model: Network, model_file: str, drives: Drives) -> W
             model_state[key] = _whole(start, key, tensor, model_state[key], reasons.get(key, ""))
     for key in (key for key in model_state if key not in state):
         start.count("new", _network_part(key), "not in the file", model_state[key].numel(), key)
+    of = f"model {start.source}" if start.source else "an unknown model"
+    if not another_backbone and start.numbers("new", "backbone") > start.numbers("loaded", "backbone"):
+        raise WeightsError(
+            f"{file}: its backbone does not fit that of {model_file}: its weights are of {of}; write a model file for "
+            "them with `--init` and the `--preset` of that model, or name the backbone to start from: "
+            "`backbone_weights` (`--backbone-weights`)"
+        )
     if start.share < LEAST_SHARE:
-        of = f"model {start.source}" if start.source else "an unknown model"
         raise WeightsError(
             f"{file}: holds {start.share:.0%} of the numbers of {model_file} (expected at least "
             f"{LEAST_SHARE:.0%}): its weights are of {of}; choose some of a model with the same backbone and channels"
