@@ -313,6 +313,14 @@ def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, 
     for text in (view, "better\n", "A missed  A invented  B missed  B invented\n"):
         assert text in page
         assert text in shown.stdout
+    assert re.search(r"^AP by range +0-10 m .*\ncar +A +\d\.\d{3} .*\ncar +B ", shown.stdout, flags=re.MULTILINE)
+    assert {path.name for path in Path("plots").iterdir()} == {
+        "precision_recall_of_both.png",
+        *(f"{plot}_{model}.png" for plot in ("errors_by_range", "misses_and_false_alarms") for model in "AB"),
+    }
+    alone = both.replace("--plot plots", "--plot curves.svg")
+    CliRunner().invoke(app, shlex.split(alone, comments=True)[1:], catch_exceptions=False)
+    assert "<svg" in Path("curves.svg").read_text()[:1000]
     image = cv2.imread("plots/precision_recall_of_both.png")
     assert image is not None
     blue, red = image[..., 0].astype(int), image[..., 2].astype(int)

@@ -104,15 +104,28 @@ class Comparison:
         files = [f"{model}: {file}" for model, file in zip(MODELS, self.files, strict=True)]
         frames = counted(first.detection.frame_count, "frames")
         how = f"{frames}, matched by {first.pairs.matched_by}; intervals from {self.resamples} resamples of the frames"
-        return "\n\n".join(["\n".join([*files, how]), aligned(rows), *self.worst.tables()])
+        return "\n\n".join(["\n".join([*files, how]), aligned(rows), self._by_range(), *self.worst.tables()])
 
     def write_plots(self, folder: Path | str) -> list[Path]:
-        """Write the curves of both as a PNG file into a folder, made where it is missing. Raises OutputError.
+        """Write the curves of both and the other plots of each into a folder, made where it is missing.
 
-        Returns its path, in a list.
+        folder: or a .pdf, .svg or .png file, which gets the curves alone. Returns the paths. Raises OutputError.
         """
-        tables = [scores.detection.overall for scores in self.scores]
-        return write_comparison(tables, self.files, Path(folder))
+        detections, pairs = [scores.detection for scores in self.scores], [scores.pairs for scores in self.scores]
+        return write_comparison(detections, pairs, self.files, Path(folder))
+
+    def _by_range(self) -> str:
+        """AP by distance, of each class with ground truth and of all, of A and of B."""
+        bins = [scores.detection.by_range for scores in self.scores]
+        rows = [("AP by range", "", *(f"{low:g}-{high:g} m" for low, high in bins[0]))]
+        overall = self.scores[0].detection.overall.classes
+        for name in (name for name in self.classes if overall[name].ground_truth_count):
+            for model, tables in zip(MODELS, bins, strict=True):
+                of_bins = [table.classes.get(name) for table in tables.values()]
+                rows.append((name, model, *(number(scores.mean_ap) if scores else "-" for scores in of_bins)))
+        for model, tables in zip(MODELS, bins, strict=True):
+            rows.append(("mAP", model, *(number(table.mean_ap) for table in tables.values())))
+        return aligned(rows, left=(0, 1))
 
 
 def _row(name: str, boxes: str, difference: Difference) -> tuple[str, ...]:

@@ -17,8 +17,9 @@ class EvaluationOptions:
 
     plot: Path | None = option(
         default=None,
-        help="Write plots: precision and recall, errors by range, missed objects and false positives from above.",
-        metavar="DIR",
+        help="Write plots: precision and recall, errors by range, missed objects and false positives from above. A "
+        ".pdf, .svg or .png file gets precision and recall alone.",
+        metavar="DIR|FILE",
     )
     max_range: float | None = option(default=None, help=MAX_RANGE_HELP, metavar="METRES")
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")

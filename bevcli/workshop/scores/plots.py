@@ -27,6 +27,7 @@ _PLOT_COLORS = (
     "#1f77b4", "#ff7f0e", "#bcbd22", "#9467bd", "#8c564b", "#7f7f7f", "#d62728", "#2ca02c", "#e377c2", "#17becf",
 )  # fmt: skip
 GRID_COLOR = "#e6e6e6"
+FIGURE_SUFFIXES = (".pdf", ".svg", ".png")
 # From the shortest matching distance to the longest.
 BLUES = ("#b8c9e8", "#7d9fd3", "#3f6fb5", "#173e7a")
 ORANGES = ("#f8cfa8", "#f0a35e", "#d9752b", "#8f4310")
@@ -40,7 +41,10 @@ _ERROR_TITLES = {
 
 
 def write_plots(detection: DetectionScores, pairs: FramePairs, folder: Path) -> list[Path]:
-    """Write the plots of scores as PNG files into a folder; return their paths. Raises OutputError."""
+    """Write the plots of scores into a folder; return their paths. Raises OutputError.
+
+    folder: or a .pdf, .svg or .png file, which gets the curves of precision and recall alone.
+    """
     figures = {
         "precision_recall.png": draw_precision_recall(detection),
         "errors_by_range.png": draw_errors_by_range(detection),
@@ -49,9 +53,15 @@ def write_plots(detection: DetectionScores, pairs: FramePairs, folder: Path) -> 
     return save_figures(figures, folder)
 
 
-def write_comparison(tables: Sequence[ScoreTable], files: Sequence[Path], folder: Path) -> list[Path]:
-    """Write the curves of two models as a PNG file into a folder; return its path. Raises OutputError."""
-    return save_figures({"precision_recall_of_both.png": draw_both(tables, files)}, folder)
+def write_comparison(
+    detections: Sequence[DetectionScores], pairs: Sequence[FramePairs], files: Sequence[Path], folder: Path
+) -> list[Path]:
+    """Write the curves of two models, and the other plots of each, as `write_plots`. Raises OutputError."""
+    figures = {"precision_recall_of_both.png": draw_both([detection.overall for detection in detections], files)}
+    for model, detection, of_frames in zip(MODELS, detections, pairs, strict=True):
+        figures[f"errors_by_range_{model}.png"] = draw_errors_by_range(detection)
+        figures[f"misses_and_false_alarms_{model}.png"] = draw_bev_sheet(detection, of_frames)
+    return save_figures(figures, folder)
 
 
 def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -> Figure:
@@ -63,10 +73,15 @@ def titled_figure(size_inches: tuple[float, float], title: str, subtitle: str) -
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write figures, by file name, into a folder, made where it is missing; return their paths. Raises OutputError."""
+    """Write figures, by file name, into a folder, made where it is missing; return their paths. Raises OutputError.
+
+    folder: or a file of FIGURE_SUFFIXES, which gets the first figure.
+    """
+    if folder.suffix.lower() in FIGURE_SUFFIXES and not folder.is_dir():
+        figures, folder = {folder.name: next(iter(figures.values()))}, folder.parent
     for name, figure in figures.items():
         with whole_file(folder / name, parents=True) as unfinished:
-            figure.savefig(unfinished, dpi=110)
+            figure.savefig(unfinished, dpi=110, format=Path(name).suffix[1:].lower())
     return [folder / name for name in figures]
 
 
