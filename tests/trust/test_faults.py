@@ -146,6 +146,7 @@ def test_few_cameras_that_are_off_do_not_make_poses_wrong():
     assert one_cause((info,), (camera,), 6) == (info, camera)
     assert one_cause((info,), (camera,) * 4, 6) == (info,)
     assert one_cause((), (camera,), 1) == (camera,)
+    assert one_cause((), (camera,) * 2, 2) == ()  # as a straight drive of KITTI seems
 
 
 def boxes(xs: list[float], names: list[str], scores: list[float] | None = None) -> Boxes3D:
