@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 import re
 import types
 import typing
@@ -127,19 +128,20 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
         of_hub = hub_model(name)
         return dict(of_hub.contents), str(of_hub.file)
     models, published = known_models(), {}
-    has_own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors").is_file()
+    own_weights = resources.files("bevcli").joinpath("weights", f"{name}.safetensors")
+    has_own_weights = name in models and own_weights.is_file()  # no other name is looked up: it may be too long for one
     if not name.endswith(".toml") and not has_own_weights:  # a name of the package is not in the table
         published = read_sources()
     of_weights = published[name].model if name in published else ""
     file = model = of_weights or name
     if model.endswith(".toml"):
-        if not Path(model).is_file():
+        if not os.path.isfile(model):  # also where the name is too long
             raise ConfigError(f"{model}: file not found; known models are {', '.join(models)}")
         text = read_text(Path(model), TOML_BYTES, error=ConfigError)
     else:
         if model not in models:
             names = ", ".join(dict.fromkeys([*models, *published]))
-            packed = f'; the folder is named "hf:./{model}"' if Path(model).is_dir() else ""
+            packed = f'; the folder is named "hf:./{model}"' if os.path.isdir(model) else ""
             raise ConfigError(f'unknown model "{model}"; expected one of {names}, or a FILE.toml{packed}')
         file = f"{model}.toml"
         text = resources.files("bevcli").joinpath("configs", file).read_text(encoding="utf-8")

@@ -4,16 +4,25 @@ A message states what is wrong and where, what was expected and found, and what 
 ``calibration.json: camera CAM_BACK: "intrinsics" is missing (expected 3x3)``.
 """
 
+import re
 from concurrent.futures import Future, TimeoutError as FutureTimeout
 from typing import TypeVar
 
-from bevcli.printing import one_line
+from bevcli.printing import LONGEST_LIST, one_line
 
 T = TypeVar("T")
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_LIST},}}")  # longer than the path of any usual file
 
 
 class BevcliError(Exception):
-    """A mistake in the user's input. The message is one line and is understandable without a traceback."""
+    """A mistake in the user's input. The message is one line and is understandable without a traceback.
+
+    A long word, such as a value of a file, is shortened, and so is the whole message.
+    """
+
+    def __init__(self, *arguments: object) -> None:
+        texts = (_LONG_WORD.sub(lambda word: one_line(word[0], LONGEST_LIST), str(each)) for each in arguments)
+        super().__init__(*texts)
 
     def __str__(self) -> str:
         return one_line(super().__str__())

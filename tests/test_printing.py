@@ -3,10 +3,12 @@
 import shutil
 from pathlib import Path
 
+import pytest
 from command_line import command
 
 from bevcli.cli.progress import Progress
-from bevcli.errors import InputError
+from bevcli.config import load_config
+from bevcli.errors import ConfigError, InputError
 from bevcli.printing import LONGEST_MESSAGE, counted, one_line, print_note, say
 
 SAMPLE = Path(__file__).parents[1] / "samples/street"
@@ -30,14 +32,14 @@ def test_a_long_text_keeps_its_beginning_and_its_end():
 
 
 def test_errors_notes_and_progress_are_clean_and_short(capsys):
-    text = f"column {NASTY} " + "x" * 5_000
+    text = f"column {NASTY} " + "xx " * 2_000
     assert str(InputError(text)) == one_line(text)
     print_note(text)
     with Progress(1, "frames", [text]) as progress:
         progress.message(text)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 3
-    assert all(rf"column {SHOWN} xxx" in line and len(line) < LONGEST_MESSAGE + 10 for line in lines)
+    assert all(rf"column {SHOWN} xx" in line and len(line) < LONGEST_MESSAGE + 10 for line in lines)
 
 
 def test_a_table_keeps_its_lines(capsys):
@@ -66,3 +68,18 @@ def test_an_error_of_the_system_is_clean(tmp_path):
 
 def test_one_thing_is_no_plural():
     assert [counted(count, "cameras") for count in (0, 1, 6)] == ["0 cameras", "1 camera", "6 cameras"]
+
+
+def test_an_error_shortens_a_text_of_a_file_and_keeps_what_to_do():
+    error = InputError(f'rig.yaml: key "{"x" * 1_000_000}" is unknown: remove it')
+    assert str(error).startswith('rig.yaml: key "xxx')
+    assert str(error).endswith('" is unknown: remove it')
+    assert len(str(error)) == len(error.args[0]) < 400
+    path = "/a" * 140
+    assert str(InputError(f"{path}: is missing")) == f"{path}: is missing"
+
+
+@pytest.mark.parametrize("name", ["x" * 300, f"{'x' * 300}.toml", "x" * 1_000_000, "a\0b"])
+def test_a_name_that_is_too_long_for_a_file_is_one_line(name):
+    with pytest.raises(ConfigError, match=r"unknown model|file not found|is too long"):
+        load_config(name)

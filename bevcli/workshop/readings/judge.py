@@ -34,6 +34,7 @@ CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
 FEWEST_PAIRS = 2  # of images, that decide
+AROUND_NS = 10**9  # before and after the frames, as images may be a little off their times
 CHORD_NS, CHORDS = 500_000_000, 60  # of short steps, by which readings are compared
 MOST_SLOW = 0.9  # share of the steps that must not be too fast
 BOTH = ("rig_axes", "pose_axes")
@@ -137,7 +138,7 @@ class _Judged:
 
     def _frames(self) -> list[tuple[int, int]]:
         """The pairs of frames that are compared."""
-        tracks = list(_tracks(self._poses).values())
+        tracks = list(_tracks(self._poses, self._times).values())
         if not tracks:
             return timed_pairs(self._times)
         at = [track.at(self._times)[0] for track in tracks]
@@ -156,7 +157,7 @@ class _Judged:
         short, nothing = self._short_steps(), np.zeros((0, 4, 4))
         motions = {
             index: (body_motions(track.at(at)[0]), body_motions(track.at(short)[0]))
-            for index, track in _tracks(poses).items()
+            for index, track in _tracks(poses, self._times).items()
         }
         for rig, (index, reading) in product(rigs, enumerate(readings)):
             stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
@@ -283,18 +284,20 @@ class _Judged:
         )
 
 
-def _tracks(poses: ReadPoses) -> dict[int, Poses]:
-    """The poses by the index of their reading."""
+def _tracks(poses: ReadPoses, times_ns: NDArray[np.int64]) -> dict[int, Poses]:
+    """The poses around the times (T,) by the index of their reading: a file may have many more."""
     motion = poses.motion
     if motion is None:
         return {}
     if not poses.readings:
         return {0: Poses.of(motion)}
+    ends = times_ns.min() - AROUND_NS, times_ns.max() + AROUND_NS
+    rows = slice(*(motion.timestamps_ns.searchsorted(ends) + (-1, 1)).clip(0))
     return {
         index: Poses(
-            motion.timestamps_ns,
-            Rotation.from_quat(np.roll(each.quaternions, -1, axis=1)).as_matrix(),
-            each.translations,
+            motion.timestamps_ns[rows],
+            Rotation.from_quat(np.roll(each.quaternions[rows], -1, axis=1)).as_matrix(),
+            each.translations[rows],
         )
         for index, each in enumerate(poses.readings)
     }
