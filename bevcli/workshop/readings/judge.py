@@ -27,7 +27,7 @@ from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pai
 from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
 
 SOUND_PX = 2.5  # largest residual of a reading that is believed, reduced pixels
-CLEAR, CLEAR_PX = 2.0, 0.5  # factor and addition, by which the residuals of all others are larger
+CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
