@@ -158,7 +158,8 @@ class BEVFormer(Network):
         has_image = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
         projections, sizes = torch.eye(4).expand(*images.shape[:2], 4, 4), torch.ones(*images.shape[:2], 2)
         cameras = projections, projections, camera_index, has_image, sizes
-        self.compute(EncoderInputs(images, *cameras, can_bus, shift, hits, None, history, rotation))
+        boxes = None if self.image_detector is None else self.find_image_boxes(images, has_image, sizes)
+        self.compute(EncoderInputs(images, *cameras, can_bus, shift, hits, None, history, rotation, boxes))
 
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> Any:
