@@ -156,9 +156,7 @@ def _estimate(
 
     drives: with those of a reference as the second item. frames: of all of them. why: notes on the model.
     """
-    from bevcli.workshop.trust.agreement import agreement
-    from bevcli.workshop.trust.estimate import as_document, frames_of_model
-    from bevcli.workshop.trust.faults import find_faults
+    from bevcli.workshop.trust import agreement as held, estimate, faults
 
     for name, is_set in (("--max-range", options.max_range is not None), ("--tracking", options.tracking)):
         if is_set:
@@ -167,13 +165,13 @@ def _estimate(
     found = []
     with Progress(frames, "frames", notes) as progress:
         for drive in (some.open(index) for some in drives for index in range(len(some))):
-            parts = frames_of_model(model, drive, temporal=temporal, after_frame=progress.advance)
-            found.append((drive.name, parts, replace(agreement(parts), findings=find_faults(model, drive))))
+            parts = list(progress.each(estimate.frames_of_model(model, drive, temporal=temporal)))
+            found.append((drive.name, parts, replace(held.agreement(parts), findings=faults.find_faults(model, drive))))
     reference = None if options.reference is None else found.pop()[2]
     scores = [(name, score) for name, _, score in found]
-    together = agreement([frame for _, parts, _ in found for frame in parts])
+    together = held.agreement([frame for _, parts, _ in found for frame in parts])
     if as_json:
-        say(json.dumps(as_document(together, scores, reference), indent=1))
+        say(json.dumps(estimate.as_document(together, scores, reference), indent=1))
         return
     if len(scores) > 1:
         say(f"all drives\n{together.table(reference)}\n")

@@ -3,7 +3,7 @@
 `agreement_of_run` and `agreement_of_boxes` take the boxes of a run that is done, or of any file.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,7 @@ RANGE_M = 50.0  # of boxes whose file states none
 NO_BOXES = Boxes2D(np.zeros((0, 4)), np.zeros(0, str), np.zeros(0))
 
 
-def estimate_score(
-    model: Model, drive: Drive, *, temporal: bool = True, after_frame: Callable[[], None] = lambda: None
-) -> Agreement:
+def estimate_score(model: Model, drive: Drive, *, temporal: bool = True) -> Agreement:
     """Agreement of a model's boxes with a detector in the images, on a drive that needs no ground truth; and faults.
 
         found = bevcli.estimate_score(model, bevcli.open_sequence("my_drive"))
@@ -40,18 +38,15 @@ def estimate_score(
         model: of `load_model`.
         drive: of `open_sequence`.
         temporal: use the frames before.
-        after_frame: called after each frame.
 
     Raises InputError where a frame cannot be read.
     """
-    found = agreement(frames_of_model(model, drive, temporal=temporal, after_frame=after_frame))
+    found = agreement(list(frames_of_model(model, drive, temporal=temporal)))
     return replace(found, findings=find_faults(model, drive))
 
 
-def frames_of_model(
-    model: Model, drive: Drive, *, temporal: bool = True, after_frame: Callable[[], None] = lambda: None
-) -> list[FrameAgreement]:
-    """The frames of a model's run over a drive, held against the witness, for `agreement`."""
+def frames_of_model(model: Model, drive: Drive, *, temporal: bool = True) -> Iterator[FrameAgreement]:
+    """The frames of a model's run over a drive, held against the witness as it goes, for `agreement`."""
 
     def frames() -> Iterator[tuple[Frame, Boxes3D, Mapping[str, Boxes2D] | None]]:
         for place, (frame, prediction) in enumerate(run(model, drive, temporal=temporal, track=False)):
@@ -59,10 +54,9 @@ def frames_of_model(
             if seen is None and _is_looked_at(place, drive):
                 seen = load_witness().seen(frame)
             yield frame, prediction.boxes_ego.transformed(frame.world_from_ego.matrix), seen
-            after_frame()
 
     classes, range_m = model.config.object_classes, model.config.bev_grid.nearest_side_m
-    return list(compared(frames(), classes, range_m, has_poses=drive.has_ego_motion))
+    return compared(frames(), classes, range_m, has_poses=drive.has_ego_motion)
 
 
 def agreement_of_run(folder: Path, drive: Drive) -> Agreement:

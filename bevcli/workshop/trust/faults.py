@@ -5,7 +5,7 @@ images; the order of colours, by the model's scores with the order reversed; an 
 weights, by what the witness sees.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -139,15 +139,12 @@ def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
     return (*color_findings(model, some, boxes), *broken)
 
 
-def frame_boxes(
-    model: Model, drive: Drive, *, temporal: bool = False, after_frame: Callable[[], None] = lambda: None
-) -> list[FrameBoxes]:
+def frame_boxes(model: Model, drive: Drive, *, temporal: bool = False) -> list[FrameBoxes]:
     """The boxes of each frame, in the ego frame; by default of each frame alone, without history."""
-    frames = []
-    for frame, prediction in run(model, drive, temporal=temporal, track=False):
-        frames.append(FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego))
-        after_frame()
-    return frames
+    return [
+        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
+        for frame, prediction in run(model, drive, temporal=temporal, track=False)
+    ]
 
 
 def color_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
