@@ -92,9 +92,10 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
         own_check = getattr(cls, "__post_init__", None)
 
         def check(self: Any) -> None:
-            _check_values(self)
+            _check_texts(self)
             if own_check is not None:
                 own_check(self)
+            _check_ranges(self)
 
         cls.__post_init__ = check
         made: Any = dataclasses.dataclass(frozen=True)(cls)
@@ -107,25 +108,29 @@ def options(panel: str = "Options") -> Callable[[_Class], _Class]:
     return decorate
 
 
-def _check_values(made: Any) -> None:
-    """Raise InputError for a text where the option's type has no such text, and for a number outside its range."""
+def _check_texts(made: Any) -> None:
+    """Raise InputError for a text where the option's type has no such text."""
     for field in dataclasses.fields(made):
         value, option = getattr(made, field.name), field.metadata.get("option")
-        if option is None or value is None:
-            continue
-        if isinstance(value, str):
+        if option is not None and isinstance(value, str):
             kinds = _kinds(type(made), field.name)  # type: ignore[arg-type]
             texts = [text for kind in kinds if get_origin(kind) is Literal for text in get_args(kind)]
             if value not in texts and not _TEXTS.intersection(kinds):
                 others = [kind.__name__ for kind in kinds if isinstance(kind, type) and kind is not type(None)]
                 wrong = f"means nothing (expected {', '.join([*texts, *others])}{option.mistaken})"
                 raise InputError(f"{_with_value(made, field.name)}: {wrong}")
-        elif isinstance(value, int | float):
+
+
+def _check_ranges(made: Any) -> None:
+    """Raise InputError for a number outside the range of its option."""
+    for field in dataclasses.fields(made):
+        value, option = getattr(made, field.name), field.metadata.get("option")
+        if option is not None and isinstance(value, int | float):
             low, high = option.minimum, option.maximum
             if (low is not None and not value >= low) or (high is not None and not value <= high):
-                ends = ((low, "more"), (high, "less"))
-                limits = ", ".join(f"{limit:g} or {word}" for limit, word in ends if limit is not None)
-                raise InputError(f"{_with_value(made, field.name)}: expected {limits}")
+                limits = f"{low:g} to {high:g}" if None not in (low, high) else f"{low if high is None else high:g}"
+                ending = "" if None not in (low, high) else " or more" if high is None else " or less"
+                raise InputError(f"{_with_value(made, field.name)}: expected {limits}{ending}")
 
 
 def _with_value(made: Any, name: str) -> str:

@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
 
 def test_the_page_is_one_screen():
     assert len(PAGE.splitlines()) <= 40
-    assert [line.split()[0] for line in COMMANDS] == ["project-debug", "run", "viz"]
+    assert [line.split()[0] for line in COMMANDS] == ["project-debug", "run", "viz", "viz"]
 
 
 def test_the_video_runs_as_on_the_page(folder):

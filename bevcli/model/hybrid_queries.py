@@ -6,6 +6,7 @@ boxes; what the layers read of the BEV map (the ground, other cameras, the histo
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +17,7 @@ from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, bra
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 from bevcli.model.pillar_projection import project_points
+from bevcli.model.upload import upload
 
 GROUP_COUNT = 4
 # Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
@@ -33,7 +35,6 @@ DOUBT, YIELD = 2.0, 3.0  # taken from the logits of learned queries without trus
 NEAREST_M = 0.3  # of the corners of a box that a camera sees
 LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
 RANGE_SCALE = 0.05  # of metres, as they enter a layer
-CORNERS = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])  # of a box
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class HybridQueries(nn.Module):
         see `forward`.
         """
         device = boxes.boxes.device
-        *_, slopes, covariance = self.lift(boxes, image_from_bev.to(device), sizes.to(device))
+        *_, slopes, covariance = self.lift(boxes, upload(image_from_bev, device), upload(sizes, device))
         (xx, xy), (_, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
         x, y = slopes.unbind(-1)
         sureness = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)  # in squares of standard deviations
@@ -196,12 +197,14 @@ def rectangles_of(codes: Tensor, image_from_bev: Tensor, sizes: Tensor) -> tuple
     A camera sees a box that lies before it and of whose rectangle at least a third is in the image. codes: (B, Q, 10).
     """
     x, y, width, length, z, height, sin, cos, *_ = codes.float().unbind(-1)
-    half = torch.stack([length, width, height], -1).clamp(max=4).exp() / 2
-    forward, left, up = (CORNERS.to(half) * half[..., None, :]).unbind(-1)  # (B, Q, 8)
+    forward, left, up = (size.clamp(max=4).exp() / 2 for size in (length, width, height))
     norm = (sin.square() + cos.square()).sqrt().clamp(min=1e-4)
-    cos_yaw, sin_yaw = -(sin / norm)[..., None], -(cos / norm)[..., None]  # the angle of a code is -yaw - pi / 2
-    place = [x[..., None] + forward * cos_yaw - left * sin_yaw, y[..., None] + forward * sin_yaw + left * cos_yaw]
-    corners = torch.stack([*place, z[..., None] + up], -1)[:, None]  # (B, 1, Q, 8, 3)
+    cos_yaw, sin_yaw = -sin / norm, -cos / norm  # the angle of a code is -yaw - pi / 2
+    places = [
+        (x + i * forward * cos_yaw - j * left * sin_yaw, y + i * forward * sin_yaw + j * left * cos_yaw, z + k * up)
+        for i, j, k in product((-1, 1), repeat=3)
+    ]
+    corners = torch.stack([torch.stack(place, -1) for place in places], -2)[:, None]  # (B, 1, Q, 8, 3)
     pixels, depth = project_points(image_from_bev[:, :, None, None], corners)
     low, high, limit = pixels.amin(-2), pixels.amax(-2), sizes[:, :, None] - 0.5
     whole = (high - low).prod(-1)
