@@ -82,11 +82,27 @@ def test_a_wrong_drive_is_told_and_a_right_one_is_not(shown, in_table):
 
 
 def test_wrong_poses_leave_out_the_calibration(shown, monkeypatch, capsys):
+    monkeypatch.setattr(calibrate, "sound_steps", lambda drive: iter([False]))
     monkeypatch.setattr(calibrate, "motion_steps", lambda drive: iter([None, (OFF,)]))
     (finding,) = check(MadeDrive(MISTAKES["km/h"][0]))
     assert finding.code == "motion-scale"
     assert check(MadeDrive(stated())) == (OFF,)
     assert "steps of the check of poses and calibration" in capsys.readouterr().err
+
+
+def test_what_fits_well_is_not_measured_any_further(monkeypatch, capsys):
+    monkeypatch.setattr(calibrate, "sound_steps", lambda drive: iter([None, True]))
+    monkeypatch.setattr(calibrate, "motion_steps", lambda drive: pytest.fail("measured all the same"))
+    assert check(MadeDrive(stated())) == ()
+    assert "the long check of them is left out" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "is_sound"), [(1.0, True), (1.05, False)])
+def test_a_few_frames_tell_that_the_sample_drive_is_sound(scale, is_sound):
+    drive = bevcli.open_sequence(STREET, ground_truth=False)
+    drive.ego_motion = replace(drive.ego_motion, translations=scale * drive.ego_motion.translations)
+    assert calibrate.last(calibrate.sound_steps(select(drive, chosen_frames(drive)))) == is_sound
 
 
 def test_one_cause_is_told_where_both_are_off():

@@ -22,6 +22,7 @@ from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.workshop.calibration import CalibrateOptions, adjustment
 from bevcli.workshop.calibration.estimates import (
+    CERTAIN_DELAY,
     HEADER,
     MEASURED_MOTION,
     CameraEstimate,
@@ -416,6 +417,55 @@ def motion_steps(drive: Drive) -> Iterator[tuple[Finding, ...] | None]:
             yield None if result is None else findings_of(result.cameras, result.interval_ms)
     except InputError as error:
         yield (Finding("motion-not-measured", "info", None, f"the drive does not show its calibration: {error}"),)
+
+
+SOUND_STEPS = READING_STEPS + 2  # of `sound_steps`
+SOUND = 0.75  # share of the limits of findings within which nothing else is measured
+SURE_POINTS = 60  # of the road, of each pair
+SURE_HEIGHT_M = 0.02  # deviation of the mean height, which also tells the scale of the poses
+
+
+def sound_steps(drive: Drive) -> Iterator[bool | None]:
+    """Whether the images of a few frames fit the stated poses and calibration well, by one search from these.
+
+    In SOUND_STEPS parts: None after each of them but the last, then False where `motion_steps` has to tell more.
+    """
+    try:
+        views = yield from read_views(drive, SHORT_PAIRS)
+    except InputError:
+        yield False
+        return
+    views = replace(views, apart=True)
+    matches = match_points(views)
+    yield None
+    unknowns = unknowns_of(views, CalibrateOptions(pairs=SHORT_PAIRS))
+    x = np.zeros(len(unknowns.deviations))
+    points = consistent(unknowns, matches, x)
+    road = road_residuals(views, unknowns, x, FLOWS_PX[-1], np.zeros(unknowns.cameras))
+    if not _most_fit(unknowns, matches, points, road):
+        yield False
+        return
+    terms = _terms(unknowns, (points, depths_of(unknowns, matches), road), x, ROAD_SCALES_PX[-1])
+    yield _is_sound(judge(drive, Measurement(views, matches, unknowns, solver.solve(unknowns, terms, x), points, road)))
+
+
+def _most_fit(unknowns: adjustment.Unknowns, matches: PointMatches, fitting: PointMatches, road: RoadResiduals) -> bool:
+    """True where most matches of each pair fit, so that it turns as stated, and its road, so that it moves as far."""
+    matched, fit, on_road = (
+        np.bincount(unknowns.groups[some.group, 0], minlength=unknowns.pairs) for some in (matches, fitting, road)
+    )
+    return bool(((fit >= MOSTLY * matched) & (on_road >= SURE_POINTS)).all())
+
+
+def _is_sound(result: CalibrationResult) -> bool:
+    """True where all is measured, and far from what would be a finding."""
+    change = np.abs([estimate.change for estimate in result.cameras])
+    deviations = np.sqrt([np.diag(estimate.covariance) for estimate in result.cameras])
+    certain, least_ms = CERTAIN_DELAY
+    limits = np.maximum([*FINE, least_ms / 1000], deviations * [*[FINE_DEVIATIONS] * len(FINE), certain])
+    is_fine = all(estimate.verdict is Verdict.FINE for estimate in result.cameras)
+    is_sure = result.whole.height_deviation_m < SURE_HEIGHT_M and not findings_of(result.cameras, result.interval_ms)
+    return is_fine and is_sure and bool((change <= SOUND * limits).all())
 
 
 def findings_of(cameras: Sequence[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:

@@ -40,10 +40,15 @@ class Views:
     rig: CameraRig  # the same with cameras for the reduced images
     pairs: tuple[tuple[int, int], ...]  # indices of the frames of each pair
     of: dict[tuple[int, int], View]  # (frame index, camera index) -> view; missing images are left out
+    apart: bool = False  # each camera by itself: nothing is compared with its neighbours
+
+    def neighbours(self) -> list[tuple[int, int]]:
+        """Each camera with its neighbours, as indices."""
+        return [] if self.apart else neighbours(self.rig.cameras)
 
     def groups(self) -> list[tuple[int, int, int]]:
         """(pair, camera of its first frame, camera of its second one): each camera with itself and its neighbours."""
-        cameras = [(index, index) for index in range(len(self.rig.cameras))] + neighbours(self.rig.cameras)
+        cameras = [(index, index) for index in range(len(self.rig.cameras))] + self.neighbours()
         return [
             (pair, first, second)
             for pair, (a, b) in enumerate(self.pairs)
@@ -62,7 +67,7 @@ class Views:
 
     def beside(self) -> list[tuple[int, int]]:
         """Each two neighbours once."""
-        return [(first, second) for first, second in neighbours(self.rig.cameras) if first < second]
+        return [(first, second) for first, second in self.neighbours() if first < second]
 
     def all_groups(self) -> list[tuple[tuple[int, int, int], bool]]:
         """Those of `groups` and then those of `at_once`, and whether the vehicle moves between their images."""
