@@ -316,7 +316,8 @@ def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, 
     assert re.search(r"^AP by range +0-10 m .*\ncar +A +\d\.\d{3} .*\ncar +B ", shown.stdout, flags=re.MULTILINE)
     assert {path.name for path in Path("plots").iterdir()} == {
         "precision_recall_of_both.png",
-        *(f"{plot}_{model}.png" for plot in ("errors_by_range", "misses_and_false_alarms") for model in "AB"),
+        "errors_by_range_of_both.png",
+        *(f"misses_and_false_alarms_{model}.png" for model in "AB"),
     }
     alone = both.replace("--plot plots", "--plot curves.svg")
     CliRunner().invoke(app, shlex.split(alone, comments=True)[1:], catch_exceptions=False)

@@ -6,5 +6,6 @@ detection           boxes of many frames -> AP, mAP, true-positive errors, NDS; 
 tracking            boxes with identities -> AMOTA and what comes with it; `association` matches them
 compare             two models on the same frames; `bootstrap` draws frames for the intervals
 worst_frames        the frames with most missed and most invented boxes
+tables              a table of scores as text, CSV and LaTeX
 record              a drive with its labels, and boxes of models, as a recording
 """

@@ -12,6 +12,7 @@ from bevcli.printing import print_note, say
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.scores.options import EvaluationOptions, ResultOptions
+from bevcli.workshop.scores.tables import write_csv, write_latex
 
 PANEL = "Score"
 
@@ -43,6 +44,8 @@ def evaluate(
     With two files of predictions, A and B: the differences B - A of AP, mAP and NDS with 95 % intervals, and the worst
     frames.
     """
+    if options.csv is not None and options.csv == options.latex:
+        raise InputError(f"--latex: {options.latex} is the file of --csv too (expected two files): name another")
     if len(predictions) == 1 and _is_unlabelled(ground_truth):
         further = {**vars(options), **vars(results), "worst": None}
         if given := [name for name, value in further.items() if value]:
@@ -65,6 +68,10 @@ def evaluate(
     say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
     for note in scores.notes:
         print_note(note)
+    for path, write in ((options.csv, write_csv), (options.latex, write_latex)):
+        if path is not None:
+            write(scores.tables(), path)
+            say(f"wrote {path}", err=True)
     if options.plot is not None:
         for path in scores.write_plots(options.plot):
             say(f"wrote {path}", err=True)

@@ -1,7 +1,7 @@
 """`compare`: the scores of two models on the same frames, their differences with intervals, and the worst frames."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import ConfigError, InputError
-from bevcli.printing import aligned, counted, number
+from bevcli.printing import counted
 from bevcli.workshop.scores.bootstrap import draw_frames, resampled
 from bevcli.workshop.scores.detection import ScoreTable
 from bevcli.workshop.scores.evaluate import Scores, finite, read, score
 from bevcli.workshop.scores.inputs import Compared
 from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.plots import write_comparison
+from bevcli.workshop.scores.tables import Cell, Table
 from bevcli.workshop.scores.worst_frames import MODELS, WorstFrames, find_worst_frames
 
 CONFIDENCE = 0.95
@@ -95,16 +96,23 @@ class Comparison:
     def table(self) -> str:
         """The differences and the worst frames as text for a terminal."""
         first = self.scores[0]
-        boxes = {name: item.ground_truth_count for name, item in first.detection.overall.classes.items()}
-        rows: list[tuple[str, ...]] = [
-            ("class", "boxes", "AP A", "AP B", "B - A", f"{100 * CONFIDENCE:.0f} % interval", "better")
-        ]
-        rows += [_row(name, str(boxes[name]), item) for name, item in self.classes.items() if boxes[name]]
-        rows += [_row("mAP", str(sum(boxes.values())), self.mean_ap), _row("NDS", "", self.nd_score)]
         files = [f"{model}: {file}" for model, file in zip(MODELS, self.files, strict=True)]
         frames = counted(first.detection.frame_count, "frames")
         how = f"{frames}, matched by {first.pairs.matched_by}; intervals from {self.resamples} resamples of the frames"
-        return "\n\n".join(["\n".join([*files, how]), aligned(rows), self._by_range(), *self.worst.tables()])
+        view = [] if self.worst.view is None else [f"Look at it: {self.worst.view}"]
+        return "\n\n".join(["\n".join([*files, how]), *map(str, self.tables()), *view])
+
+    def tables(self) -> Iterator[Table]:
+        """The tables of that text, with their numbers."""
+        classes = self.scores[0].detection.overall.classes
+        boxes = {name: item.ground_truth_count for name, item in classes.items()}
+        rows = [_row(name, boxes[name], item) for name, item in self.classes.items() if boxes[name]]
+        rows += [_row("mAP", sum(boxes.values()), self.mean_ap), _row("NDS", "", self.nd_score)]
+        interval = f"{100 * CONFIDENCE:.0f} % interval"
+        columns = ("class", "boxes", "AP A", "AP B", "B - A", interval, "better")
+        yield Table("classes", columns, rows, signed=("B - A", interval))
+        yield self._by_range()
+        yield from self.worst.tables()
 
     def write_plots(self, folder: Path | str) -> list[Path]:
         """Write the curves of both and the other plots of each into a folder, made where it is missing.
@@ -114,34 +122,23 @@ class Comparison:
         detections, pairs = [scores.detection for scores in self.scores], [scores.pairs for scores in self.scores]
         return write_comparison(detections, pairs, self.files, Path(folder))
 
-    def _by_range(self) -> str:
+    def _by_range(self) -> Table:
         """AP by distance, of each class with ground truth and of all, of A and of B."""
         bins = [scores.detection.by_range for scores in self.scores]
-        rows = [("AP by range", "", *(f"{low:g}-{high:g} m" for low, high in bins[0]))]
+        columns = ("AP by range", "", *(f"{low:g}-{high:g} m" for low, high in bins[0]))
+        rows: list[tuple[Cell, ...]] = []
         overall = self.scores[0].detection.overall.classes
         for name in (name for name in self.classes if overall[name].ground_truth_count):
             for model, tables in zip(MODELS, bins, strict=True):
                 of_bins = [table.classes.get(name) for table in tables.values()]
-                rows.append((name, model, *(number(scores.mean_ap) if scores else "-" for scores in of_bins)))
+                rows.append((name, model, *(scores.mean_ap if scores else math.nan for scores in of_bins)))
         for model, tables in zip(MODELS, bins, strict=True):
-            rows.append(("mAP", model, *(number(table.mean_ap) for table in tables.values())))
-        return aligned(rows, left=(0, 1))
+            rows.append(("mAP", model, *(table.mean_ap for table in tables.values())))
+        return Table("AP by range", columns, rows, left=(0, 1))
 
 
-def _row(name: str, boxes: str, difference: Difference) -> tuple[str, ...]:
-    low, high = map(_signed, difference.interval)
-    return (
-        name,
-        boxes,
-        *map(number, difference.values),
-        _signed(difference.difference),
-        f"{low} to {high}",
-        difference.better,
-    )
-
-
-def _signed(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:+.3f}"
+def _row(name: str, boxes: int | str, difference: Difference) -> tuple[Cell, ...]:
+    return (name, boxes, *difference.values, difference.difference, difference.interval, difference.better)
 
 
 def compare(

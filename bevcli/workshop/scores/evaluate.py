@@ -16,13 +16,14 @@ from bevcli.frame import MAP_CLASSES, BevMap
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.matching import ERRORS, DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
-from bevcli.printing import aligned, counted, number
+from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.scores import inputs
 from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
 from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.plots import write_plots
+from bevcli.workshop.scores.tables import Cell, Table
 from bevcli.workshop.scores.tracking import TrackingScores, score_tracks
 from bevcli.workshop.scores.worst_frames import WorstFrames, find_worst_frames
 from bevcli.workshop.vad.driving_scores import DrivingScores, evaluate_driving
@@ -88,14 +89,19 @@ class FrameScores:
 
     def table(self) -> str:
         """The scores of boxes by class, range and visibility, and those of further results, as text for a terminal."""
-        parts = [_classes(self.detection), _ranges(self.detection)]
+        view = [] if self.worst is None or self.worst.view is None else [f"Look at it: {self.worst.view}"]
+        return "\n\n".join([*map(str, self.tables()), *view])
+
+    def tables(self) -> Iterator[Table]:
+        """The tables of that text, with their numbers."""
+        yield _classes(self.detection)
+        yield _ranges(self.detection)
         if self.detection.by_visibility:
-            parts.append(_visibilities(self.detection))
+            yield _visibilities(self.detection)
         if self.segmentation is not None:
-            parts.append(_maps(self.segmentation))
+            yield _maps(self.segmentation)
         for scores in self.others:
-            parts += scores.tables()
-        return "\n\n".join(parts)
+            yield from scores.tables()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,37 +402,39 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _classes(detection: DetectionScores) -> str:
+def _classes(detection: DetectionScores) -> Table:
     table = detection.overall
     distances = [f"AP@{distance:g}m" for distance in next(iter(table.classes.values())).aps]
-    rows = [("class", "boxes", "AP", *distances, "recall", *_ERROR_HEADS)]
+    rows: list[tuple[Cell, ...]] = []
     for name, scores in table.classes.items():
-        numbers = (scores.mean_ap, *scores.aps.values(), scores.recall, *(scores.errors[error] for error in ERRORS))
-        rows.append((name, str(scores.ground_truth_count), *map(number, numbers)))
-    means = [number(table.errors[name]) for name in ERRORS]
-    rows.append(("all", str(table.ground_truth_count), number(table.mean_ap), *[""] * len(distances), "", *means))
-    return f"{aligned(rows)}\n\nmAP {number(table.mean_ap)}   NDS {number(table.nd_score)}"
+        errors = (scores.errors[error] for error in ERRORS)
+        rows.append((name, scores.ground_truth_count, scores.mean_ap, *scores.aps.values(), scores.recall, *errors))
+    means = [table.errors[name] for name in ERRORS]
+    rows.append(("all", table.ground_truth_count, table.mean_ap, *[""] * len(distances), "", *means))
+    below = f"\n\nmAP {number(table.mean_ap)}   NDS {number(table.nd_score)}"
+    columns, sums = ("class", "boxes", "AP", *distances, "recall", *_ERROR_HEADS), {"NDS": table.nd_score}
+    return Table("classes", columns, rows, below=below, sums=sums)
 
 
-def _ranges(detection: DetectionScores) -> str:
+def _ranges(detection: DetectionScores) -> Table:
     bins = detection.by_range
-    rows = [("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins))]
+    rows: list[tuple[Cell, ...]] = []
     for name in detection.overall.classes:
         of_bins = [table.classes.get(name) for table in bins.values()]
-        rows.append((name, *(number(scores.mean_ap) if scores else "-" for scores in of_bins)))
-    rows.append(("mAP", *(number(table.mean_ap) for table in bins.values())))
-    rows.append(("NDS", *(number(table.nd_score) for table in bins.values())))
-    return aligned(rows)
+        rows.append((name, *(scores.mean_ap if scores else math.nan for scores in of_bins)))
+    rows.append(("mAP", *(table.mean_ap for table in bins.values())))
+    rows.append(("NDS", *(table.nd_score for table in bins.values())))
+    return Table("AP by range", ("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins)), rows)
 
 
-def _visibilities(detection: DetectionScores) -> str:
-    rows = [("visibility", "boxes", "found", "recall, mean over classes")]
-    for (low, high), table in detection.by_visibility.items():
-        counts = (str(table.ground_truth_count), str(table.prediction_count))
-        rows.append((f"{100 * low:.0f}-{100 * high:.0f} %", *counts, number(table.mean_recall)))
-    return aligned(rows)
+def _visibilities(detection: DetectionScores) -> Table:
+    rows = [
+        (f"{100 * low:.0f}-{100 * high:.0f} %", table.ground_truth_count, table.prediction_count, table.mean_recall)
+        for (low, high), table in detection.by_visibility.items()
+    ]
+    return Table("visibility", ("visibility", "boxes", "found", "recall, mean over classes"), rows)
 
 
-def _maps(segmentation: SegmentationScores) -> str:
-    rows = [("map class", "IoU"), *((name, number(iou)) for name, iou in segmentation.iou.items())]
-    return f"{aligned(rows)}\n({segmentation.frame_count} maps)"
+def _maps(segmentation: SegmentationScores) -> Table:
+    below = f"\n({segmentation.frame_count} maps)"
+    return Table("maps", ("map class", "IoU"), list(segmentation.iou.items()), below=below)

@@ -13,7 +13,7 @@ MAX_RANGE_HELP = (
 
 @options()
 class EvaluationOptions:
-    """The options of `evaluate` for boxes and maps, and the folder of its plots."""
+    """The options of `evaluate` for boxes and maps, and the files of its plots and tables."""
 
     plot: Path | None = option(
         default=None,
@@ -21,6 +21,12 @@ class EvaluationOptions:
         ".pdf, .svg or .png file gets precision and recall alone.",
         metavar="DIR|FILE",
     )
+    csv: Path | None = option(
+        default=None,
+        help="Write all tables as CSV: table, row, column and value, one row a number, not rounded.",
+        metavar="FILE",
+    )
+    latex: Path | None = option(default=None, help="Write all tables as LaTeX, with booktabs.", metavar="FILE")
     max_range: float | None = option(default=None, help=MAX_RANGE_HELP, metavar="METRES")
     count_missing: bool = option(default=False, help="Count ground-truth frames without a prediction as missed.")
 

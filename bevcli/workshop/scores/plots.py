@@ -47,7 +47,7 @@ def write_plots(detection: DetectionScores, pairs: FramePairs, folder: Path) -> 
     """
     figures = {
         "precision_recall.png": draw_precision_recall(detection),
-        "errors_by_range.png": draw_errors_by_range(detection),
+        "errors_by_range.png": draw_errors_by_range([detection]),
         "misses_and_false_alarms.png": draw_bev_sheet(detection, pairs),
     }
     return save_figures(figures, folder)
@@ -56,10 +56,12 @@ def write_plots(detection: DetectionScores, pairs: FramePairs, folder: Path) -> 
 def write_comparison(
     detections: Sequence[DetectionScores], pairs: Sequence[FramePairs], files: Sequence[Path], folder: Path
 ) -> list[Path]:
-    """Write the curves of two models, and the other plots of each, as `write_plots`. Raises OutputError."""
-    figures = {"precision_recall_of_both.png": draw_both([detection.overall for detection in detections], files)}
+    """Write curves and errors by range of two models, and the other plot of each. Raises OutputError."""
+    figures = {
+        "precision_recall_of_both.png": draw_both([detection.overall for detection in detections], files),
+        "errors_by_range_of_both.png": draw_errors_by_range(detections),
+    }
     for model, detection, of_frames in zip(MODELS, detections, pairs, strict=True):
-        figures[f"errors_by_range_{model}.png"] = draw_errors_by_range(detection)
         figures[f"misses_and_false_alarms_{model}.png"] = draw_bev_sheet(detection, of_frames)
     return save_figures(figures, folder)
 
@@ -146,19 +148,30 @@ def _class_panels(figure: Figure, count: int) -> NDArray[Any]:
     return panels
 
 
-def draw_errors_by_range(detection: DetectionScores) -> Figure:
-    """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean."""
-    bins = {ends: table for ends, table in detection.by_range.items() if table.classes}
-    subtitle = "thick: mean of the classes; no point where nothing was found"
+def draw_errors_by_range(detections: Sequence[DetectionScores]) -> Figure:
+    """AP and the five true-positive errors by distance from the ego vehicle, for each class and their mean.
+
+    detections: of one model, or of A (lines) and B (dashed); of two, the classes with ground truth.
+    """
+    both = len(detections) > 1
+    classes = detections[0].overall.classes
+    with_truth = {name for name, scores in classes.items() if scores.ground_truth_count or not both}
+    colors = {name: color for name, color in plot_colors(classes).items() if name in with_truth}
+    models = "; A: lines, B: dashed" if both else ""
+    subtitle = f"thick: mean of the classes{models}; no point where nothing was found"
     figure = titled_figure((15, 8.5), "AP and errors by range", subtitle)
     panels = figure.subplots(2, 3, sharex=True)
-    middles = [sum(ends) / 2 for ends in bins]
     for axes, error in zip(panels.flat, (None, *ERRORS), strict=True):
-        for name, color in plot_colors(detection.overall.classes).items():
-            values = [_value(table.classes.get(name), error) for table in bins.values()]
-            axes.plot(middles, values, color=color, linewidth=1, marker=".", label=name, alpha=0.8)
-        means = [table.mean_ap if error is None else table.errors[error] for table in bins.values()]
-        axes.plot(middles, means, color="black", linewidth=2.5, marker="o", label="mean")
+        for detection, model, style in zip(detections, MODELS, ("-", "--"), strict=False):
+            bins = {ends: table for ends, table in detection.by_range.items() if table.classes}
+            middles = [sum(ends) / 2 for ends in bins]
+            for name, color in colors.items():
+                values = [_value(table.classes.get(name), error) for table in bins.values()]
+                label = name if model == MODELS[0] else None
+                axes.plot(middles, values, style, color=color, linewidth=1, marker=".", label=label, alpha=0.8)
+            means = [table.mean_ap if error is None else table.errors[error] for table in bins.values()]
+            label = f"mean {model}" if both else "mean"
+            axes.plot(middles, means, style, color="black", linewidth=2.5, marker="o", label=label)
         axes.set_title("AP" if error is None else _ERROR_TITLES[error], fontsize=11)
         axes.set_ylim(bottom=0)
         axes.set_xticks(sorted({end for ends in bins for end in ends}))
@@ -166,7 +179,7 @@ def draw_errors_by_range(detection: DetectionScores) -> Figure:
     for axes in panels[-1]:
         axes.set_xlabel("distance from the ego vehicle (m)")
     handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", frameon=False)
+    figure.legend(handles, labels, loc="outside right center", frameon=False, handlelength=3 if both else None)
     return figure
 
 

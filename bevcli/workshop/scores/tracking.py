@@ -16,9 +16,10 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import MATCH_DISTANCE_M, ClassRanges, ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
-from bevcli.printing import aligned, number
+from bevcli.printing import number
 from bevcli.workshop.scores.association import MATCH, MISS, SWITCH, TrackedBoxes, associate, near_pairs, scored_tracks
 from bevcli.workshop.scores.inputs import Compared
+from bevcli.workshop.scores.tables import Cell, Table
 
 
 @dataclass(frozen=True)
@@ -243,21 +244,25 @@ class TrackingScores:
         }
         return {"tracking": content}
 
-    def tables(self) -> Iterator[str]:
+    def tables(self) -> Iterator[Table]:
         """The metrics by class, and their sums or means over the classes, in two tables; AMOTA."""
         overall = self.overall
         rows = {**{name: scored.metrics for name, scored in self.classes.items()}, "all": overall}
-        for columns in (_QUALITY, _ERRORS):
-            cells = [
-                (name, *(number(values[metric], digits) for metric, digits in columns.values()))
-                for name, values in rows.items()
-            ]
-            yield aligned([("class", *columns), *cells])
         switches = overall["ids"] / self.scenes if self.scenes else math.nan
-        yield (
-            f"AMOTA {number(overall['amota'])}   AMOTP {number(overall['amotp'])} m   "
+        below = (
+            f"\n\nAMOTA {number(overall['amota'])}   AMOTP {number(overall['amotp'])} m   "
             f"identity switches {number(switches, 1)} per scene (scenes: {self.scenes}, frames: {self.frames})"
         )
+        per_scene = {"IDS per scene": switches}
+        yield _table("tracks", _QUALITY, rows)
+        yield replace(_table("errors of tracks", _ERRORS, rows), below=below, sums=per_scene)
+
+
+def _table(name: str, columns: Mapping[str, tuple[str, int]], classes: Mapping[str, Mapping[str, float]]) -> Table:
+    rows: list[tuple[Cell, ...]] = [
+        (label, *(float(values[metric]) for metric, _ in columns.values())) for label, values in classes.items()
+    ]
+    return Table(name, ("class", *columns), rows, {column: digits for column, (_, digits) in columns.items()})
 
 
 def score_tracks(compared: Compared) -> TrackingScores:

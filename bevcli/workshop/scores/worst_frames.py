@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.matching import ScoredBoxes
-from bevcli.printing import aligned
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.format import is_drive
 from bevcli.sequences.nuscenes import is_nuscenes_root
 from bevcli.workshop.scores.detection import ClassMatches
 from bevcli.workshop.scores.inputs import Compared
+from bevcli.workshop.scores.tables import Table
 
 MODELS = ("A", "B")
 
@@ -120,19 +120,18 @@ class WorstFrames:
         pairs = zip(self.missed[:, index].tolist(), self.invented[:, index].tolist(), strict=True)
         return [count for pair in pairs for count in pair]
 
-    def tables(self) -> Iterable[str]:
-        """One table of all lists, and the command."""
-        rows = [["worst frames", "", "boxes", *self._columns()]]
+    def tables(self) -> Iterable[Table]:
+        """One table of all lists."""
+        rows: list[list[str | int]] = []
         several = len({frame.stamp.scene for frame in self.frames}) > 1
         for name, indices in self.lists.items():
             for rank, index in enumerate(indices):
                 stamp = self.frames[index].stamp
                 frame = f"{stamp.scene} frame {stamp.index}" if several else f"frame {stamp.index}"
-                counts = map(str, (self.boxes[index], *self._counts(index)))
+                counts = (int(self.boxes[index]), *self._counts(index))
                 rows.append(["" if rank else _heading(name), frame, *counts])
-        yield f"{aligned(rows, left=(0, 1))}\n(scores from the largest F1 of each class at {self.distance_m:g} m on)"
-        if self.view is not None:
-            yield f"Look at it: {self.view}"
+        below = f"\n(scores from the largest F1 of each class at {self.distance_m:g} m on)"
+        yield Table("worst frames", ("worst frames", "", "boxes", *self._columns()), rows, left=(0, 1), below=below)
 
 
 def _heading(name: str) -> str:

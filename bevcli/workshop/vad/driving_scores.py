@@ -15,13 +15,14 @@ from bevcli.frame import FrameStamp, Ground, result_of
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.printing import aligned, counted, number
+from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes import is_nuscenes_root
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, FrameLines, LinesFile, MapLines, read_lines
 from bevcli.workshop.scores.inputs import Compared, FramePairs, ScoredInput
 from bevcli.workshop.scores.options import ResultOptions
+from bevcli.workshop.scores.tables import Table
 from bevcli.workshop.vad import driving_metrics as metrics
 from bevcli.workshop.vad.plan import Plan, read_plans
 
@@ -102,28 +103,30 @@ class DrivingScores:
             }
         return content
 
-    def tables(self) -> Iterator[str]:
+    def tables(self) -> Iterator[Table]:
         """One table for each kind of scores that was asked for."""
         if (lines := self.lines) is not None:
-            rows = [("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in metrics.THRESHOLDS_M))]
-            for name, of_class in lines.ap.items():
-                numbers = (lines.mean_by_class[name], *of_class.values())
-                rows.append((name, str(lines.truth_count[name]), *map(number, numbers)))
-            yield f"{aligned(rows)}\n\nmap mAP {number(lines.mean_ap)} ({counted(lines.frame_count, 'frames')})"
+            rows: list[tuple[str | float, ...]] = [
+                (name, lines.truth_count[name], lines.mean_by_class[name], *of_class.values())
+                for name, of_class in lines.ap.items()
+            ]
+            columns = ("map line", "lines", "AP", *(f"AP@{limit:g}m" for limit in metrics.THRESHOLDS_M))
+            below = f"\n\nmap mAP {number(lines.mean_ap)} ({counted(lines.frame_count, 'frames')})"
+            yield Table("lines of the map", columns, rows, below=below, sums={"map mAP": lines.mean_ap})
         if (motion := self.motion) is not None:
-            rows = [("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate")]
-            for name, sums in motion.items():
-                rows.append((name, str(sums.truths), *map(number, sums.metrics.values())))
-            yield aligned(rows)
+            rows = [(name, sums.truths, *map(float, sums.metrics.values())) for name, sums in motion.items()]
+            yield Table("forecasts", ("forecasts", "objects", "EPA", "minADE m", "minFDE m", "miss rate"), rows)
         if (plan := self.plan) is not None:
             averaged = _horizons(plan, averaged=True)
             at = _horizons(plan, averaged=False)
-            rows = [("planned path", *averaged["L2"], "", *averaged["L2"])]
+            rows, seconds = [], tuple(averaged["L2"])
             for name, unit, factor in (("L2", "m", 1), ("collision", "%", 100)):
-                cells = [[number(factor * value) for value in of[name].values()] for of in (averaged, at)]
+                cells = [[float(factor * value) for value in of[name].values()] for of in (averaged, at)]
                 rows.append((f"{name} {unit}", *cells[0], "", *cells[1]))
+            names = ("", *(f"mean up to {end}" for end in seconds), "", *(f"at {end}" for end in seconds))
             explained = "left: mean up to the horizon (ST-P3, VAD); right: at the horizon, vehicles only (UniAD)"
-            yield f"{aligned(rows)}\n({len(plan.distances_m)} paths; {explained})"
+            below = f"\n({len(plan.distances_m)} paths; {explained})"
+            yield Table("planned paths", ("planned path", *seconds, "", *seconds), rows, names=names, below=below)
 
 
 def _horizons(plan: metrics.PlanScores, *, averaged: bool) -> dict[str, dict[str, float]]:
