@@ -81,6 +81,20 @@ class Network(TemporalModel):
         assert self.image_detector is not None
         return self.image_detector.image_boxes(self.image_detector(images.flatten(0, 1)), has_image, image_sizes)
 
+    def look(
+        self, images: Tensor, has_image: Tensor, image_from_bev: Tensor, image_sizes: Tensor
+    ) -> tuple[ImageBoxes | None, Tensor]:
+        """The boxes of the detector beside the backbone, None without one; and the rig as they level it.
+
+        The rig is image_from_bev itself where the model does not level it. Arguments: see `ModelInputs`.
+        """
+        if self.image_detector is None:
+            return None, image_from_bev
+        boxes = self.find_image_boxes(images, has_image, image_sizes)
+        if self.hybrid_queries is None or not self.config.hybrid_queries.level:
+            return boxes, image_from_bev
+        return boxes, self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes)
+
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""
         return self.image_tokens(self.neck(maps)[: self.config.encoder_levels], camera_index)

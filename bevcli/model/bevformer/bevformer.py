@@ -80,12 +80,9 @@ class BEVFormer(Network):
 
     def geometry(self, inputs: ModelInputs, history: Tensor | None) -> EncoderInputs:
         """The host part of a step: what it needs of calibration and poses, as tensors. Arguments as for `forward`."""
-        size, image_from_level = inputs.image_size, inputs.image_from_bev
-        rays = rotation = boxes = None
-        if self.image_detector is not None:
-            boxes = self.find_image_boxes(inputs.images, inputs.has_image, inputs.image_sizes)
-            if self.hybrid_queries is not None and self.config.hybrid_queries.level:
-                image_from_level = self.hybrid_queries.levelled(boxes, image_from_level, inputs.image_sizes)
+        size = inputs.image_size
+        rays = rotation = None
+        boxes, image_from_level = self.look(inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
         if self.calibration_embedding is not None:
             rays = self.calibration_embedding(image_from_level, self.config.level_shapes_of(size), size)
         if history is not None:

@@ -108,12 +108,8 @@ class RecurrentStep(ExportedStep):
     ) -> tuple[Tensor, ...]:
         """One step; `RecurrentForm` documents every input and output."""
         network = self.network
-        images, boxes, image_from_level = self.normalised(images), None, image_from_bev
-        if network.image_detector is not None:
-            assert image_sizes is not None
-            boxes = network.find_image_boxes(images, has_image, image_sizes)
-            if network.hybrid_queries is not None and self.config.hybrid_queries.level:
-                image_from_level = network.hybrid_queries.levelled(boxes, image_from_bev, image_sizes)
+        images = self.normalised(images)
+        boxes, image_from_level = network.look(images, has_image, image_from_bev, image_sizes)
         maps = network.image_maps(images)
         image_features = network.tokens_of(maps, camera_index)
         if network.calibration_embedding is not None:
