@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from bevcli.weights.model_file import model_file_for as model_file_for
     from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
-    from bevcli.workshop.engines.write_model import export_onnx as export_onnx, quantize as quantize
+    from bevcli.workshop.engines.exported import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.formats.export import export as export
     from bevcli.workshop.hub.pack import pack_model as pack_model

@@ -11,7 +11,7 @@ import bevcli
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.options import gather, refuse, spread
 from bevcli.workshop.formats import LabelOptions, WriteOptions
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.synth import DriveOptions
 
 ROOT = Path(__file__).parents[1]
 

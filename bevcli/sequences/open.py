@@ -90,7 +90,7 @@ def open_steps(
     if options.frames is not None:
         drive = select_range(drive, options.frames)
     if options.odometry:
-        from bevcli.workshop.odometry.drives import with_measured_motion
+        from bevcli.workshop.odometry.report import with_measured_motion
 
         yield from with_measured_motion(drive, whole)
     else:

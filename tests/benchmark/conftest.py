@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bevcli.workshop.benchmark import made_up
+from bevcli.workshop.benchmark import versions
 
 SMALL = {
     "size = [800, 450]": "size = [160, 90]",
@@ -31,7 +31,7 @@ SMALL_UNIAD = {
 def images_made_once() -> Iterator[None]:
     """The images of made-up drives, which are always the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(made_up, "_jpeg", cache(made_up._jpeg))
+        patch.setattr(versions, "_jpeg", cache(versions._jpeg))
         yield
 
 

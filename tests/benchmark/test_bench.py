@@ -15,10 +15,9 @@ from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.inference.load import installed_engines
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.workshop.benchmark import made_up, measure
-from bevcli.workshop.benchmark.made_up import MadeUpDrive
+from bevcli.workshop.benchmark import measure, versions
 from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits, count_operations
-from bevcli.workshop.benchmark.versions import Comparison, Version
+from bevcli.workshop.benchmark.versions import Comparison, MadeUpDrive, Version
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -26,8 +25,8 @@ def small_images():
     """Images of a fourth of the width and the same field of view."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):
-            patch.setattr(made_up, name, getattr(made_up, name) // 4)
-        patch.setattr(made_up, "_jpeg", cache(made_up._jpeg.__wrapped__))
+            patch.setattr(versions, name, getattr(versions, name) // 4)
+        patch.setattr(versions, "_jpeg", cache(versions._jpeg.__wrapped__))
         yield
 
 

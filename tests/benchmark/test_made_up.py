@@ -6,7 +6,7 @@ import torch
 from bevcli.config import load_config
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.pillar_projection import find_hits, project_pillars
-from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
+from bevcli.workshop.benchmark.versions import MadeUpDrive, made_up_model
 
 
 def test_the_cameras_see_about_as_many_cells_as_nuscenes():

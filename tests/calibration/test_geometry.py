@@ -10,14 +10,20 @@ from scipy.spatial.transform import Rotation
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.adjustment import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
+from bevcli.workshop.calibration.estimates import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.road import followed, level_corrections, sees_road
 from bevcli.workshop.calibration.views import PointMatches, View, Views, depths_of, unknowns_of
-from bevcli.workshop.correspondence.images import texture
-from bevcli.workshop.correspondence.points import FEWEST_AT_ONCE, Features, matched
-from bevcli.workshop.correspondence.residuals import EpipolarResiduals, RoadResiduals
+from bevcli.workshop.correspondence.points import FEWEST_AT_ONCE, Features, matched, texture
+from bevcli.workshop.correspondence.residuals import (
+    EpipolarResiduals,
+    RoadResiduals,
+    derivatives,
+    geometry_at,
+    solve,
+    spread,
+    values,
+)
 from bevcli.workshop.correspondence.road import beside_way, points_of_road
-from bevcli.workshop.correspondence.solver import derivatives, geometry_at, solve, spread, values
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 BLANK = np.zeros((2, 2), dtype=np.uint8)

@@ -9,8 +9,8 @@ import torch
 from command_line import MINI_TOML, command
 
 from bevcli._version import __version__
-from bevcli.workshop.benchmark import made_up, measure
-from bevcli.workshop.checks import commands as checks, speed, torch_checks
+from bevcli.workshop.benchmark import measure, versions
+from bevcli.workshop.checks import commands as checks, torch_checks
 
 
 def test_the_text_fits_a_screen_and_names_no_user(tmp_path, monkeypatch):
@@ -90,16 +90,16 @@ def test_the_kernels_are_those_that_a_model_gets(monkeypatch):
 def test_speed_measures_each_model_until_the_time_is_over(tmp_path, monkeypatch):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):
-        monkeypatch.setattr(made_up, name, getattr(made_up, name) // 4)
+        monkeypatch.setattr(versions, name, getattr(versions, name) // 4)
     # Other tests keep the images of the usual size.
-    monkeypatch.setattr(made_up, "_jpeg", getattr(made_up._jpeg, "__wrapped__", made_up._jpeg))
+    monkeypatch.setattr(versions, "_jpeg", getattr(versions._jpeg, "__wrapped__", versions._jpeg))
     monkeypatch.setattr(measure, "CPU_EDGE", 256)
     monkeypatch.setattr(measure, "COPIED_FLOATS", 1 << 20)
-    monkeypatch.setattr(speed, "MODELS", (str(tmp_path / "mini.toml"),))
-    monkeypatch.setattr(speed, "FRAMES", 2)
-    rows = list(speed.measure_speed().values())
+    monkeypatch.setattr(measure, "MODELS", (str(tmp_path / "mini.toml"),))
+    monkeypatch.setattr(measure, "FRAMES", 2)
+    rows = list(measure.measure_speed().values())
     assert "GB/s" in rows[0]
     assert rows[1].endswith("2 frames)")
     assert rows[2].endswith("2 frames)")
-    monkeypatch.setattr(speed, "BUDGET_S", -1.0)
-    assert list(speed.measure_speed().values())[1:3] == ["not measured: the minute is over"] * 2
+    monkeypatch.setattr(measure, "BUDGET_S", -1.0)
+    assert list(measure.measure_speed().values())[1:3] == ["not measured: the minute is over"] * 2

@@ -24,8 +24,8 @@ from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.registry import entries, load
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.engines.export_form import replace_parts
 from bevcli.workshop.engines.export_onnx import export_onnx, read_metadata
-from bevcli.workshop.engines.export_step import replace_parts
 from bevcli.workshop.engines.exported import check_exported, load_exported
 
 onnx = pytest.importorskip("onnx")

@@ -26,8 +26,7 @@ from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.workshop.scores.bootstrap import draw_frames, resampled
-from bevcli.workshop.scores.compare import interval
+from bevcli.workshop.scores.compare import draw_frames, interval, resampled
 from bevcli.workshop.scores.detection import RECALLS, evaluate_detections
 from bevcli.workshop.scores.inputs import open_ground_truth
 

@@ -21,8 +21,8 @@ from bevcli.sequences.open import open_steps
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.batch.job import Job
-from bevcli.workshop.odometry import drives, measure
-from bevcli.workshop.odometry.drives import MOST_RATE_HZ, at_most_rate, with_measured_motion
+from bevcli.workshop.odometry import measure, report
+from bevcli.workshop.odometry.report import MOST_RATE_HZ, at_most_rate, with_measured_motion
 from bevcli.workshop.scores.inputs import pair_frames
 
 FRAMES = 4
@@ -50,7 +50,7 @@ def measuring(monkeypatch, true_motion):
         for a, b in pairwise(true_motion.poses[indices]):
             yield replace(true_motion.steps[0], ego_a_from_ego_b=inverse(a) @ b)
 
-    monkeypatch.setattr(drives, "measure_steps", measured)
+    monkeypatch.setattr(report, "measure_steps", measured)
     return seen
 
 
@@ -103,7 +103,7 @@ def test_a_fast_drive_is_thinned(folder):
 
 def test_scenes_have_motions_of_their_own(monkeypatch):
     drive = MemoryDrive(5, scenes="aabbb")
-    monkeypatch.setattr(drives, "measure_steps", lambda scene: iter(motion_of(scene).steps))
+    monkeypatch.setattr(report, "measure_steps", lambda scene: iter(motion_of(scene).steps))
     *_, found = with_measured_motion(drive, drive)
     assert found.has_ego_motion
     assert len(found.notes) == 2

@@ -17,8 +17,14 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply, rigid, rotation_about_z
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep
-from bevcli.workshop.odometry.picture import GroundView, WatchedDrive, ground_cells, stitched, write_picture
-from bevcli.workshop.odometry.recording import write_recording
+from bevcli.workshop.odometry.picture import (
+    GroundView,
+    WatchedDrive,
+    ground_cells,
+    stitched,
+    write_picture,
+    write_recording,
+)
 from bevcli.workshop.odometry.report import (
     against_stated,
     check_measured,

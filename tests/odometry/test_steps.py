@@ -16,10 +16,16 @@ from bevcli.geometry.transforms import Array, Pose, inverse, rigid, rotation_abo
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
 from bevcli.workshop.odometry.flow import road_flow
 from bevcli.workshop.odometry.measure import Chain, MeasuredStep, MotionMeter, leaps
-from bevcli.workshop.odometry.step_views import motion_of, next_slopes
-from bevcli.workshop.odometry.steps import Candidate
-from bevcli.workshop.odometry.views import CELL_M, SHAPE, RoadPicture
-from bevcli.workshop.odometry.votes import CHANCE, distance_votes, point_votes, stands, under_the_road, ways_of_points
+from bevcli.workshop.odometry.step_views import CELL_M, SHAPE, RoadPicture, motion_of, next_slopes
+from bevcli.workshop.odometry.steps import (
+    CHANCE,
+    Candidate,
+    distance_votes,
+    point_votes,
+    stands,
+    under_the_road,
+    ways_of_points,
+)
 
 TEXEL_M = 0.06
 WALLS_M = 7.0  # to both sides

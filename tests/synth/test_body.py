@@ -13,10 +13,9 @@ from bevcli.geometry.transforms import Pose, apply, inverse, rigid, rotation_abo
 from bevcli.inference.preprocess import Preprocessor, network_from_image
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.synth.body import MOST_DEG, BodyMotion
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.city import Route
-from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive
+from bevcli.workshop.synth.drive import MOST_DEG, BodyMotion, RenderedDrive, RenderedFrame, export_drive
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, tilt
 from bevcli.workshop.synth.traffic import EgoTrack
 from bevcli.workshop.training.targets import ground_truth_boxes

@@ -15,10 +15,10 @@ from bevcli.geometry.transforms import apply
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, read_lines
+from bevcli.workshop.synth import Weather, parse_resolution
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive, render as render_sequence
 from bevcli.workshop.synth.looks import WEATHER_NAMES
-from bevcli.workshop.synth.options import Weather, parse_resolution
 from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering
 
 

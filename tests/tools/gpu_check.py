@@ -43,12 +43,19 @@ from bevcli.model.prepare import methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.printing import say
-from bevcli.workshop.benchmark.made_up import MadeUpDrive, made_up_model
 from bevcli.workshop.benchmark.measure import time_runs
-from bevcli.workshop.benchmark.versions import QueryResults, Version, difference, largest_differences, textbook_version
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.benchmark.versions import (
+    MadeUpDrive,
+    QueryResults,
+    Version,
+    difference,
+    largest_differences,
+    made_up_model,
+    textbook_version,
+)
+from bevcli.workshop.synth import DriveOptions
+from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import prepare_training
-from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.trainer import Trainer
 from bevcli.writing import write_whole
 

@@ -37,9 +37,9 @@ from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.lift import Lift, LiftConfig
 from bevcli.model.nanodet import PIXEL_MEAN, PIXEL_STD, NanoDet, NanoDetConfig
 from bevcli.printing import say
+from bevcli.workshop.synth import parse_seeds
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
-from bevcli.workshop.synth.options import parse_seeds
 from bevcli.workshop.synth.rig import RigDistribution, draw_rig
 
 FRAMES, RATE_HZ = 6, 0.4  # of a drive

@@ -18,10 +18,10 @@ from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_f
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.printing import say
+from bevcli.workshop.synth import Body
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.corruptions import blur_kernel, low_light, to_uint8
 from bevcli.workshop.synth.drive import FIRST_TIMESTAMP_NS, RenderedDrive, RenderedFrame, export_drive
-from bevcli.workshop.synth.options import Body
 from bevcli.workshop.synth.rig import EGO_AXES_FROM_CAMERA, DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 
 FRAMES, RATE_HZ = 12, 2.0

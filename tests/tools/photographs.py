@@ -30,10 +30,10 @@ import torch
 from bevcli.config import TRAINING, as_toml, load_config, load_table, read_model_file
 from bevcli.inference.load import choose_device
 from bevcli.printing import say
+from bevcli.workshop.synth import DriveOptions, parse_seeds
 from bevcli.workshop.synth.drives import RenderedDrives
-from bevcli.workshop.synth.options import DriveOptions, parse_seeds
+from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, prepare_training
-from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.trainer import Trainer, save_weights
 
 CHANGES = {

@@ -17,7 +17,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
 from bevcli.inference.load import Model
 from bevcli.inference.options import TORCH
-from bevcli.workshop.odometry import compare, views
+from bevcli.workshop.odometry import compare, step_views
 from bevcli.workshop.odometry.measure import measure_steps
 from bevcli.workshop.robustness.conditions import choose_conditions
 
@@ -270,7 +270,7 @@ def without_repetition() -> None:
         rig = [(one.intrinsics.tolist(), one.ego_from_camera.tolist()) for one in drive.rig.cameras]
         return hashlib.sha256(pixels + repr(rig).encode()).digest()
 
-    views.features = once(views.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
+    step_views.features = once(step_views.features, lambda image: hashlib.sha256(image.pixels.tobytes()).digest())
     compare.measure_steps = once(lambda drive: list(measure_steps(drive)), images_of)
 
 

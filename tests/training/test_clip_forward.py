@@ -16,12 +16,12 @@ from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.synth import DriveOptions
+from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, ProcessGroup, TrainingConfig, TrainingJob, prepare_training
-from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
 from bevcli.workshop.training.trainer import Trainer
 

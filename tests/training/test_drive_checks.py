@@ -14,10 +14,10 @@ from small_fleet import write_fleet
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
 from bevcli.sequences.native.folder import FolderDrive
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
-from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.validation import check_scored_drives, check_training_drives
 

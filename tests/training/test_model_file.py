@@ -14,7 +14,7 @@ from bevcli.config import TRAINING, as_toml, load_config, load_table
 from bevcli.errors import BevcliError, InputError
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.config import BevFrameConfig
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.model_file import (
     NUSCENES_SIZES,

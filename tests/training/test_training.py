@@ -19,13 +19,13 @@ from bevcli.cli.stop_signals import StopSignals
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
 from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.workshop.synth import DriveOptions, parse_seeds
 from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, scored_drives, training_drives
-from bevcli.workshop.synth.options import DriveOptions, parse_seeds
+from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob, check_folder, prepare_training
 from bevcli.workshop.training.losses import DenseLossConfig
-from bevcli.workshop.training.options import TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.trainer import (
     Trainer,

@@ -49,7 +49,7 @@ def bench(
     The peak throughput is the rate of matrix products and of copying memory, measured in the same run. Nothing else
     should run on the machine at the same time.
     """
-    from bevcli.workshop.benchmark import made_up, measure, versions
+    from bevcli.workshop.benchmark import measure, versions
 
     if options.engines:
         if model_options != ModelOptions() or options.against is not None or options.profile is not None:
@@ -57,12 +57,12 @@ def bench(
         table = versions.compare_engines(options.model, options.frames)
         say(json.dumps(table.as_data(), indent=1) if as_json else table.text())
         return
-    model = made_up.model_to_time(options.model, model_options)
+    model = versions.model_to_time(options.model, model_options)
     parts = " and ".join(f"--{name}" for name in ("against", "profile") if getattr(options, name) is not None)
     if parts:
         model.require_parts(parts)
     if model.needs_export:
-        drive = made_up.MadeUpDrive(made_up.CALIBRATION_FRAMES)
+        drive = versions.MadeUpDrive(versions.CALIBRATION_FRAMES)
         model = model.in_engine(drive.rig, drive, report=print_note)
     against_plain = options.against == "plain"
     result = measure.run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)

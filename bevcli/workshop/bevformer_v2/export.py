@@ -18,8 +18,7 @@ from bevcli.workshop.bevformer_v2.window import (
     frames_at,
     kept,
 )
-from bevcli.workshop.engines.export_form import ExportForm, Port, camera_feed, camera_ports
-from bevcli.workshop.engines.export_step import ExportedStep
+from bevcli.workshop.engines.export_form import ExportedStep, ExportForm, Port, camera_feed, camera_ports
 
 
 class WindowStep(ExportedStep):

@@ -1,10 +1,9 @@
 """A calibration that is measured from the drive itself.
 
 In the order of the work, on top of the wing `correspondence`, which finds what two images share:
-    adjustment           what is estimated, and the geometry that follows from it
+    estimates            what is estimated, the geometry that follows, what is said of each camera and of the whole rig
     views                the frame pairs that are used, their grey images, matched points
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
-    estimates            what is said of each camera and of the whole rig
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
     core_options         options of `bevcli run` and `bevcli project-debug`
     in_turn              the same for a drive without poses, whose motion the wing `odometry` measures

@@ -20,20 +20,26 @@ from bevcli.geometry.transforms import Array
 from bevcli.options import gather
 from bevcli.printing import aligned
 from bevcli.sequences.files.calibration_file import write_calibration
-from bevcli.workshop.calibration import CalibrateOptions, adjustment
+from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import (
     CERTAIN_DELAY,
     HEADER,
+    HEIGHT,
     MEASURED_MOTION,
+    OF_CAMERA,
+    OF_RIG,
     CameraEstimate,
     RigEstimate,
+    Unknowns,
     Verdict,
     change_text,
     common_delay_text,
     delay_text,
     either_text,
+    moved,
     rig_text,
     row,
+    with_estimated_turns,
 )
 from bevcli.workshop.calibration.road import followed, level_corrections, road_residuals, search_heights, sees_road
 from bevcli.workshop.calibration.views import (
@@ -46,9 +52,18 @@ from bevcli.workshop.calibration.views import (
     read_views,
     unknowns_of,
 )
-from bevcli.workshop.correspondence import solver
-from bevcli.workshop.correspondence.images import WIDTH
-from bevcli.workshop.correspondence.residuals import DepthResiduals, RoadResiduals
+from bevcli.workshop.correspondence.points import WIDTH
+from bevcli.workshop.correspondence.residuals import (
+    DepthResiduals,
+    RoadResiduals,
+    Solution,
+    Term,
+    geometry_at,
+    honest_covariance,
+    solve,
+    spread,
+    values,
+)
 from bevcli.writing import write_whole
 
 Result = TypeVar("Result")
@@ -70,8 +85,8 @@ class Measurement:
 
     views: Views
     matches: PointMatches  # of all pairs
-    unknowns: adjustment.Unknowns
-    solution: solver.Solution
+    unknowns: Unknowns
+    solution: Solution
     points: PointMatches  # the matches that were used
     road: RoadResiduals
 
@@ -81,13 +96,13 @@ def measure(views: Views, matches: PointMatches, options: CalibrateOptions) -> G
     unknowns = unknowns_of(views, options)
     within, x = matches.where(matches.same), np.zeros(len(unknowns.deviations))
     for scale in SCALES_PX:
-        x = solver.solve(unknowns, [(within, scale)], x).x
+        x = solve(unknowns, [(within, scale)], x).x
     at_once, depths = matches.where(~matches.moves), depths_of(unknowns, matches)
     for scale in SCALES_PX if len(at_once.group) else ():
-        x = solver.solve(unknowns, [(within, SCALES_PX[-1]), (at_once, scale), (depths, scale)], x).x
+        x = solve(unknowns, [(within, SCALES_PX[-1]), (at_once, scale), (depths, scale)], x).x
     points = consistent(unknowns, matches.where(matches.same | ~matches.moves), x)
     yield
-    heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
+    heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
     x[heights] += search_heights(views, unknowns, x)
     yield
     ties, signals, roadless = matches.where(~matches.same & matches.moves), np.zeros(unknowns.cameras), x
@@ -105,14 +120,14 @@ def measure(views: Views, matches: PointMatches, options: CalibrateOptions) -> G
     sees = sees_road(unknowns, road, ties, x) & (shown >= LEAST_SHOWN)
     road = road.where(sees[unknowns.groups[road.group, 1]])
     for _ in range(TURN_ROUNDS):
-        solution = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, ROAD_SCALES_PX[-1]), x)
-        x, unknowns = solution.x, adjustment.with_estimated_turns(unknowns, solution)
+        solution = solve(unknowns, _terms(unknowns, (points, depths, road), x, ROAD_SCALES_PX[-1]), x)
+        x, unknowns = solution.x, with_estimated_turns(unknowns, solution)
     return Measurement(views, matches, unknowns, solution, points, road)
 
 
 def _with_road(
     views: Views,
-    unknowns: adjustment.Unknowns,
+    unknowns: Unknowns,
     x: Array,
     matches: tuple[PointMatches, DepthResiduals, PointMatches],
     most_px: float,
@@ -126,36 +141,36 @@ def _with_road(
     points, depths, ties = matches
     road = road_residuals(views, unknowns, x, most_px, signals)
     for scale in ROAD_SCALES_PX:
-        x = solver.solve(unknowns, _terms(unknowns, (points, depths, road), x, scale), x).x
+        x = solve(unknowns, _terms(unknowns, (points, depths, road), x, scale), x).x
     if most_px == FLOWS_PX[0]:
         levels = level_corrections(unknowns, road, ties, x)
         x = x + levels
         # Shared points tell the level, and the road then tells the height to the step of the search.
-        heights = np.arange(unknowns.cameras) * adjustment.OF_CAMERA + adjustment.HEIGHT
+        heights = np.arange(unknowns.cameras) * OF_CAMERA + HEIGHT
         x[heights] += search_heights(views, unknowns, x, levels[heights] != 0, KERB_M)
     return x, road
 
 
 def _terms(
-    unknowns: adjustment.Unknowns,
+    unknowns: Unknowns,
     measured: tuple[PointMatches, DepthResiduals, RoadResiduals],
     x: Array,
     road_scale: float,
-) -> list[solver.Term]:
+) -> list[Term]:
     """All kinds of residuals, with the spread that they have at x (P,)."""
-    terms: list[solver.Term] = []
+    terms: list[Term] = []
     for residuals, least in zip(measured, (POINT_SCALE_PX, POINT_SCALE_PX, road_scale), strict=True):
         cameras = unknowns.groups[residuals.group, 1:] @ np.array([1, unknowns.cameras])
-        terms.append((residuals, np.maximum(least, solver.spread(unknowns, residuals, x, cameras))))
+        terms.append((residuals, np.maximum(least, spread(unknowns, residuals, x, cameras))))
     return terms
 
 
-def consistent(unknowns: adjustment.Unknowns, points: PointMatches, x: Array) -> PointMatches:
+def consistent(unknowns: Unknowns, points: PointMatches, x: Array) -> PointMatches:
     """The points that fit at x (P,), of the image pairs in which most of them do.
 
     Repeated texture gives pairs whose matches fit a motion, but not that of the vehicle.
     """
-    fits = np.abs(solver.values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
+    fits = np.abs(values(unknowns, points, x)[:, 0]) < CONSISTENT_PX
     count = len(unknowns.groups)
     fitting, matched = (np.bincount(group, minlength=count) for group in (points.group[fits], points.group))
     shares = fitting / np.maximum(matched, 1)
@@ -275,9 +290,7 @@ def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
     cameras = tuple(_estimate(index, measurement, changes[index], covariances[index]) for index in range(len(changes)))
     corrected = tuple(
         replace(camera, ego_from_camera=pose) if estimate.verdict is Verdict.CORRECTED else camera
-        for camera, pose, estimate in zip(
-            stated_rig.cameras, adjustment.moved(unknowns.stated, changes), cameras, strict=True
-        )
+        for camera, pose, estimate in zip(stated_rig.cameras, moved(unknowns.stated, changes), cameras, strict=True)
     )
     rig = replace(stated_rig, cameras=corrected)
     return CalibrationResult(drive.name, stated_rig, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
@@ -352,12 +365,12 @@ def _reason(
     return f"{shown}{size}"
 
 
-def _turned_deg(unknowns: adjustment.Unknowns) -> float:
+def _turned_deg(unknowns: Unknowns) -> float:
     """The turns of the vehicle in all pairs, as the square root of their sum of squares.
 
     The error of the stated rotation of a pair looks like a rotation of the camera by that error over the turn.
     """
-    motion = solver.geometry_at(unknowns, np.zeros(len(unknowns.deviations))).ego_b_from_ego_a
+    motion = geometry_at(unknowns, np.zeros(len(unknowns.deviations))).ego_b_from_ego_a
     turns = np.arctan2(motion[:, 1, 0], motion[:, 0, 0])
     _, first = np.unique(unknowns.turns[unknowns.moves], return_index=True)
     return float(np.degrees(np.linalg.norm(turns[unknowns.moves][first])))
@@ -365,7 +378,7 @@ def _turned_deg(unknowns: adjustment.Unknowns) -> float:
 
 def _residual_px(measurement: Measurement, index: int, x: Array) -> float:
     mine = (measurement.unknowns.groups[measurement.points.group, 1:] == index).all(-1)
-    residuals_px = np.abs(solver.values(measurement.unknowns, measurement.points, x)[mine])
+    residuals_px = np.abs(values(measurement.unknowns, measurement.points, x)[mine])
     return float(np.median(residuals_px)) if residuals_px.size else 0.0
 
 
@@ -383,8 +396,8 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
         The whole rig.
     """
     unknowns, solution = measurement.unknowns, measurement.solution
-    deviations, count = unknowns.deviations, adjustment.OF_CAMERA * unknowns.cameras
-    covariance = solver.honest_covariance(unknowns, solution, unknowns.groups[:, 0])
+    deviations, count = unknowns.deviations, OF_CAMERA * unknowns.cameras
+    covariance = honest_covariance(unknowns, solution, unknowns.groups[:, 0])
     scale = deviations[:count]
     marginal = np.linalg.inv(covariance[:count, :count] / np.outer(scale, scale)) - np.eye(count)
     sizes, axes = np.linalg.eigh((marginal + marginal.T) / 2)
@@ -392,15 +405,15 @@ def observed(measurement: Measurement) -> tuple[Array, Array, RigEstimate]:
     change = scale * (seen @ (seen.T @ (solution.x[:count] / scale)))
     within = seen @ np.diag(1 / (1 + sizes[sizes >= LEAST_INFORMATION])) @ seen.T + unseen @ unseen.T
     whole = np.outer(scale, scale) * within + np.diag(np.tile(FINEST, unknowns.cameras) ** 2)
-    blocks = whole.reshape(unknowns.cameras, adjustment.OF_CAMERA, unknowns.cameras, adjustment.OF_CAMERA)
+    blocks = whole.reshape(unknowns.cameras, OF_CAMERA, unknowns.cameras, OF_CAMERA)
     changes = unknowns.of_camera(change)
-    of_rig, of_rig_deviations = solution.x[-adjustment.OF_RIG :], np.sqrt(np.diag(covariance)[-adjustment.OF_RIG :])
+    of_rig, of_rig_deviations = solution.x[-OF_RIG:], np.sqrt(np.diag(covariance)[-OF_RIG:])
     (along, across), (along_deviation, across_deviation) = np.degrees([of_rig[1:], of_rig_deviations[1:]]).tolist()
     rig = RigEstimate(
         scale=float(of_rig[0]),
         scale_deviation=float(of_rig_deviations[0]),
-        height_m=-float(changes[:, adjustment.HEIGHT].mean()),
-        height_deviation_m=float(np.sqrt(blocks[:, adjustment.HEIGHT, :, adjustment.HEIGHT].sum()) / unknowns.cameras),
+        height_m=-float(changes[:, HEIGHT].mean()),
+        height_deviation_m=float(np.sqrt(blocks[:, HEIGHT, :, HEIGHT].sum()) / unknowns.cameras),
         tilt_deg=(along, across),
         tilt_deviation_deg=(along_deviation, across_deviation),
     )
@@ -446,10 +459,10 @@ def sound_steps(drive: Drive) -> Iterator[bool | None]:
         yield False
         return
     terms = _terms(unknowns, (points, depths_of(unknowns, matches), road), x, ROAD_SCALES_PX[-1])
-    yield _is_sound(judge(drive, Measurement(views, matches, unknowns, solver.solve(unknowns, terms, x), points, road)))
+    yield _is_sound(judge(drive, Measurement(views, matches, unknowns, solve(unknowns, terms, x), points, road)))
 
 
-def _most_fit(unknowns: adjustment.Unknowns, matches: PointMatches, fitting: PointMatches, road: RoadResiduals) -> bool:
+def _most_fit(unknowns: Unknowns, matches: PointMatches, fitting: PointMatches, road: RoadResiduals) -> bool:
     """True where most matches of each pair fit, so that it turns as stated, and its road, so that it moves as far."""
     matched, fit, on_road = (
         np.bincount(unknowns.groups[some.group, 0], minlength=unknowns.pairs) for some in (matches, fitting, road)

@@ -17,9 +17,8 @@ from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, calibration_steps
 from bevcli.workshop.calibration.estimates import RigEstimate
 from bevcli.workshop.calibration.views import steps_reached
-from bevcli.workshop.odometry.drives import at_most_rate
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
-from bevcli.workshop.odometry.report import check_measured
+from bevcli.workshop.odometry.report import at_most_rate, check_measured
 
 MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more

@@ -16,10 +16,18 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.calibration.adjustment import HEIGHT, OF_CAMERA, Unknowns
+from bevcli.workshop.calibration.estimates import HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.views import Views
-from bevcli.workshop.correspondence.images import THREADS
-from bevcli.workshop.correspondence.residuals import SHORTEST, EpipolarResiduals, GroupGeometry, Indices, RoadResiduals
+from bevcli.workshop.correspondence.points import THREADS
+from bevcli.workshop.correspondence.residuals import (
+    SHORTEST,
+    EpipolarResiduals,
+    GroupGeometry,
+    Indices,
+    RoadResiduals,
+    geometry_at,
+    values,
+)
 from bevcli.workshop.correspondence.road import (
     RoadPoints,
     beside_way,
@@ -30,7 +38,6 @@ from bevcli.workshop.correspondence.road import (
     tiles,
     votes,
 )
-from bevcli.workshop.correspondence.solver import geometry_at, values
 
 FAR_M, STEP_M = 0.6, 0.03  # of the corrections that are tried
 LEAST_CORRELATION = 0.6

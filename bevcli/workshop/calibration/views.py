@@ -14,9 +14,8 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.adjustment import DELAYS_S, OF_PAIR, Unknowns
-from bevcli.workshop.correspondence.images import THREADS, GreyImage, grey_image, reduced
-from bevcli.workshop.correspondence.points import features, matched, neighbours
+from bevcli.workshop.calibration.estimates import DELAYS_S, OF_PAIR, Unknowns
+from bevcli.workshop.correspondence.points import THREADS, GreyImage, features, grey_image, matched, neighbours, reduced
 from bevcli.workshop.correspondence.residuals import DepthResiduals, EpipolarResiduals
 
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair

@@ -218,7 +218,7 @@ def checks(options: ChecksOptions, as_json: Json = False) -> None:
     """
     facts = {title: tell(check) for title, check in CHECKS.items()}
     if options.speed:
-        from bevcli.workshop.checks.speed import measure_speed
+        from bevcli.workshop.benchmark.measure import measure_speed
 
         print_note("measuring for about a minute; nothing else should run on the machine")
         facts["speed"] = tell(measure_speed)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import OUTSIDE, Camera
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.correspondence.images import texture
+from bevcli.workshop.correspondence.points import texture
 from bevcli.workshop.correspondence.residuals import GroupGeometry, rays_of_road_points
 
 NEAREST, FARTHEST = 1.3, 9.0  # road points, from the camera, in heights of the camera

@@ -35,11 +35,11 @@ def export_onnx(
     an output: the BEV map, or with v2 models image features. The file's metadata documents every input and output.
     docs/deploy.md shows how to run it. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.workshop.engines import exported, write_model
+    from bevcli.workshop.engines import exported
 
     loaded = bevcli.load_model(model, options=replace(model_options, device="cpu"))
     drive = None if options.check is None else bevcli.open_sequence(options.check, rate_hz=loaded.config.rate_hz)
-    target, loaded = write_model.write_model(loaded, file, options)
+    target, loaded = exported.write_model(loaded, file, options)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
         say("\n".join(exported.difference_lines(list(exported.check_exported(target, loaded, drive)))))
@@ -83,7 +83,7 @@ def quantize(
     `bevcli run`, `validate` and `bench` take the new file as `--model`. Check the accuracy on drives of your own with
     `bevcli validate`. Needs pip install 'bevcli[onnx]'.
     """
-    from bevcli.workshop.engines import exported, write_model
+    from bevcli.workshop.engines import exported
 
     if not options.calibrate:
         raise typer.BadParameter("is missing (expected a drive)", param_hint="--int8-drive")
@@ -91,7 +91,7 @@ def quantize(
     drive = None
     if options.check is not None:
         drive = bevcli.open_sequence(options.check, rate_hz=exported.load_exported(model, engine).config.rate_hz)
-    target = write_model.write_quantized(model, options.calibrate, options.frames, engine, file)
+    target = exported.write_quantized(model, options.calibrate, options.frames, engine, file)
     say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
     if drive is not None:
         say("\n".join(exported.difference_lines(list(exported.check_exported(target, model, drive, engine)))))

@@ -38,6 +38,7 @@ from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.view import select_range
 from bevcli.workshop.engines import OnnxOptions
+from bevcli.workshop.engines.export_form import DeformableConvolution
 from bevcli.workshop.engines.export_onnx import (
     EXPORTERS,
     QUANTIZERS,
@@ -48,7 +49,6 @@ from bevcli.workshop.engines.export_onnx import (
     quantize,
     require,
 )
-from bevcli.workshop.engines.export_step import DeformableConvolution
 from bevcli.workshop.engines.exported import Arrays, ExportedModel, LoadedFile
 from bevcli.writing import user_cache, whole_file, write_whole
 

@@ -1,16 +1,246 @@
 """The exported form of a model: names, shapes and units of a file's inputs and outputs, as its metadata states them."""
 
-from collections.abc import Iterator, Mapping
+import copy
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
 
 from bevcli.model.config import ImageConfig, ModelConfig
-from bevcli.model.step import ModelInputs, PreparedFrame, model_inputs
+from bevcli.model.decoder import best_boxes
+from bevcli.model.deformable_attention import FeatureMaps
+from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, split_offsets_and_mask
+from bevcli.model.ego_motion import rotate_history
+from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
+from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
-from bevcli.workshop.engines.export_step import ExportedStep, RecurrentStep, with_most_cameras
+
+Output = TypeVar("Output")
+
+
+class ExportedStep(nn.Module):
+    """The base of the exported steps, for batches of one. Images enter before normalisation."""
+
+    network: Any
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(
+        self, model: Any, deformable_convolution: "DeformableConvolution", slots: int, *, decode: bool
+    ) -> None:
+        """A copy of the model, with its parts replaced; the model itself stays unchanged.
+
+        slots: K of `SlottedHits`, at most the number of cameras.
+        """
+        super().__init__()
+        self.network = copy.deepcopy(model).cpu().float().eval().requires_grad_(False)
+        self.config, self.slots, self.decode = model.config, slots, decode
+        fold_batch_norms(self.network, torch.device("meta"))  # for no device: with standard operators
+        replace_parts(self.network, deformable_convolution)
+        image = self.config.image
+        width, height = image.padded_size
+        self.image_size = height, width
+        self.register_buffer("image_mean", torch.tensor(image.mean)[:, None, None])
+        self.register_buffer("image_std", torch.tensor(image.std)[:, None, None])
+
+    def image_features(self, images: Tensor, camera_index: Tensor) -> FeatureMaps:
+        """The tokens of images (1, N, H, W, 3) BGR, 0 to 255; camera_index: (N,)."""
+        return self.network.image_features(self.normalised(images), camera_index)
+
+    def normalised(self, images: Tensor) -> Tensor:
+        """Images (1, N, H, W, 3) BGR, 0 to 255 -> (1, N, 3, H, W) as the network takes them."""
+        planes = images.permute(0, 1, 4, 2, 3)
+        if self.config.image.color_order == "rgb":
+            planes = planes.flip(2)
+        return (planes - self.image_mean) / self.image_std
+
+    def hits(self, image_from_bev: Tensor, has_image: Tensor) -> "SlottedHits":
+        """The cameras that see each cell, for a batch of one; arguments as for `Pillars.project`."""
+        projection = self.network.pillars.project(image_from_bev, self.image_size, has_image)
+        hit = projection.hit[0].float()  # (N, Y·X)
+        cells = hit.shape[1]
+        filled, camera = hit.t().topk(self.slots, dim=1)
+        index = camera * cells + torch.arange(cells)[:, None]  # index in N·Y·X
+        points = projection.reference_points[0].flatten(0, 1).index_select(0, index.flatten())
+        count = hit.sum(0)
+        return SlottedHits(
+            camera=camera,
+            filled=filled,
+            reference_points=points.unflatten(0, (cells, self.slots)),
+            cameras_per_cell=count.clamp(min=1)[:, None],
+            most_cameras=count.max()[None].long(),
+        )
+
+    def outputs(self, outputs: ModelOutputs, most_cameras: Tensor) -> tuple[Tensor, ...]:
+        """The outputs in the order of `ExportForm.outputs`. most_cameras: (1,), see `SlottedHits`."""
+        named = outputs.by_name
+        boxes = decode_boxes(named["class_logits"], named["box_codes"], self.config) if self.decode else ()
+        return (*with_most_cameras(tuple(named.values()), most_cameras), *boxes)
+
+
+def with_most_cameras(outputs: Sequence[Output], most_cameras: Output) -> tuple[Output, ...]:
+    """The model's outputs with one that only exported files have, after the BEV map, the logits and the box codes."""
+    return (*outputs[:3], most_cameras, *outputs[3:])
+
+
+class RecurrentStep(ExportedStep):
+    """`BEVFormer.forward` as a graph, which has no optional inputs: `use_previous` says whether there is a history."""
+
+    def forward(
+        self,
+        images: Tensor,
+        image_from_bev: Tensor,
+        camera_index: Tensor,
+        has_image: Tensor,
+        can_bus: Tensor,
+        shift: Tensor,
+        rotation: Tensor,
+        previous_bev: Tensor,
+        use_previous: Tensor,
+        image_sizes: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """One step; `RecurrentForm` documents every input and output."""
+        network = self.network
+        images = self.normalised(images)
+        boxes, image_from_level = network.look(images, has_image, image_from_bev, image_sizes)
+        maps = network.image_maps(images)
+        image_features = network.tokens_of(maps, camera_index)
+        if network.calibration_embedding is not None:
+            rays = image_from_level, image_features.level_shapes, self.image_size
+            image_features = image_features.scaled(*network.calibration_embedding(*rays))
+        bev_query = network.bev_queries(can_bus)
+        position = network.bev_queries.position()
+        center = self.config.ego_motion.history_rotation_center
+        history = rotate_history(previous_bev, rotation, self.config.bev_grid, center)
+        centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
+        reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
+        hits = self.hits(image_from_level, has_image)
+        with_history = torch.stack([history, bev_query], dim=1)
+        bev = bev_query
+        for layer in network.encoder.layers:
+            assert isinstance(layer, EncoderLayer)
+            bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
+            bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
+        boxes = boxes or network.backbone.image_boxes(maps, has_image, image_sizes)
+        outputs = network.detect_with_images(bev, boxes, image_from_bev, image_from_level, image_sizes)
+        boxes = outputs.image_boxes
+        return (*self.outputs(outputs, hits.most_cameras), *(boxes.by_name.values() if boxes else ()))
+
+
+def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """`ModelOutputs.boxes` for a batch of one, in the graph.
+
+    class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
+    height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
+    """
+    best = best_boxes(class_logits, box_codes, config.decoder)
+    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
+    # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
+    yaw = torch.atan2(-cos, -sin)
+    sizes = [log.exp() for log in (log_length, log_width, log_height)]
+    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best.scores, best.label
+
+
+DeformableConvolution = Literal["operator", "gridsample"]
+
+
+@dataclass(frozen=True)
+class SlottedHits:
+    """The cameras that see each cell, in K slots a cell, so that every shape is fixed. A slot may be empty.
+
+    Attributes:
+        camera: (Y·X, K) int64, the camera of each slot, any camera where it is empty.
+        filled: (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0.
+        reference_points: (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the
+            padded image.
+        cameras_per_cell: (Y·X, 1) float32, the number of cameras that see a cell, at least 1.
+        most_cameras: (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot.
+    """
+
+    camera: Tensor
+    filled: Tensor
+    reference_points: Tensor
+    cameras_per_cell: Tensor
+    most_cameras: Tensor
+
+
+class SlottedSpatialCrossAttention(nn.Module):
+    """Takes the place of `SpatialCrossAttention`, for batches of one and hits in slots.
+
+    The maps of all cameras are stacked into one tall map, with a row of zeros between them, so that GridSample can
+    sample another camera at every point.
+    """
+
+    def __init__(self, original: SpatialCrossAttention) -> None:
+        super().__init__()
+        self.points, self.attention = original.points, original.attention
+
+    def forward(self, query: Tensor, image_features: FeatureMaps, hits: SlottedHits) -> Tensor:
+        """As `SpatialCrossAttention.forward`."""
+        offsets, logits = (part[:, :, 0] for part in self.attention.predict(query[0]))
+        weights = self.attention.sampling.weights(logits)
+        heads, levels = self.attention.shape[0], image_features.level_shapes
+        values = self.attention.value_projection(image_features.tokens).unflatten(-1, (heads, -1))
+        points = hits.reference_points
+        points = points.repeat(1, 1, self.points // points.shape[2], 1)[:, None]  # (Y·X, 1, K, P, 2)
+        summed = torch.zeros(())
+        maps = values.split([height * width for height, width in levels], dim=1)
+        for level, ((height, width), level_map) in enumerate(zip(levels, maps, strict=True)):
+            x = points[..., 0] + offsets[:, :, None, level, :, 0] / width  # (Y·X, heads, K, P)
+            y = points[..., 1] * height + offsets[:, :, None, level, :, 1] - 0.5
+            # One row above or below a map is zero, and so is everything beyond.
+            y = y.clamp(-1, height) + (hits.camera * (height + 1)).float()[:, None, :, None]
+            tall = tall_map(level_map, height, width)
+            grid = torch.stack([2 * x - 1, (2 * y + 1) / tall.shape[2] - 1], dim=-1)
+            sampled = F.grid_sample(tall, grid.transpose(0, 1).flatten(2, 3), align_corners=False)
+            weight = weights[:, :, None, level] * hits.filled[:, None, :, None]  # (Y·X, heads, K, P)
+            summed = summed + (sampled * weight.transpose(0, 1).flatten(2)[:, None]).sum(-1)  # (heads, D, Y·X)
+        attended = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
+        return self.attention.output_projection(attended / hits.cameras_per_cell)[None]
+
+
+def tall_map(values: Tensor, height: int, width: int) -> Tensor:
+    """The maps of all cameras below each other, each followed by a row of zeros.
+
+    values: (N, height·width, heads, D) -> (heads, D, N·(height + 1), width).
+    """
+    planes = values.permute(2, 3, 0, 1).unflatten(-1, (height, width))  # (heads, D, N, height, width)
+    return F.pad(planes, (0, 0, 0, 1)).flatten(2, 3)
+
+
+class DeformConvOperator(nn.Module):
+    """Takes the place of a `ModulatedDeformableConvolution`: the operator DeformConv of ONNX, opset 19."""
+
+    def __init__(self, original: ModulatedDeformableConvolution) -> None:
+        super().__init__()
+        self.weight, self.bias, self.stride = original.weight, original.bias, original.stride
+        self.offset_and_mask = original.offset_and_mask
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (B, C, H, W) -> (B, O, H', W'). Only for export: in PyTorch its result is zero."""
+        offsets, mask = split_offsets_and_mask(self.offset_and_mask(x))
+        bias = x.new_zeros(len(self.weight)) if self.bias is None else self.bias
+        return torch.onnx.ops.symbolic(
+            "DeformConv",
+            [x, self.weight, offsets.flatten(1, 2), bias, mask],
+            {"kernel_shape": [3, 3], "pads": [1, 1, 1, 1], "strides": [self.stride, self.stride]},
+            dtype=x.dtype,
+            shape=(len(x), len(self.weight), *mask.shape[-2:]),
+            version=19,
+        )
+
+
+def replace_parts(network: nn.Module, deformable_convolution: "DeformableConvolution") -> None:
+    """Replaces, in place, the spatial cross-attentions and, for "operator", the deformable convolutions."""
+    for name, module in list(network.named_modules()):
+        if isinstance(module, SpatialCrossAttention):
+            network.set_submodule(name, SlottedSpatialCrossAttention(module))
+        elif isinstance(module, ModulatedDeformableConvolution) and deformable_convolution == "operator":
+            network.set_submodule(name, DeformConvOperator(module))
 
 
 @dataclass(frozen=True)

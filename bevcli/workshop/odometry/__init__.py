@@ -1,16 +1,12 @@
 """The vehicle's motion, measured from the images and the calibration alone.
 
 In the order of the work:
-    views         what is kept of a frame: its images, their features, the road seen from above
-    votes         how far the vehicle drove: the votes of tiles of the road, and of matched points
+    step_views    what is kept of a frame, the points matched in two of them, and what is estimated of a step
     flow          points of the road in two views from above
-    step_views    two frames: the points matched in both, and what is estimated of the step between them
-    steps         the motions that a step may have: those that fit matched points and points of the road
+    steps         votes how far the vehicle drove, and the motions that fit matched points and points of the road
     measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig
-    report        the measured motion in words and files, and against stated poses
-    picture       odometry.png: the way on the road, and curves
-    recording     odometry.rrd
-    drives        the option `odometry` of `open_sequence`: drives with their measured motion
+    report        the measured motion in words and files, and the option `odometry` of `open_sequence`
+    picture       odometry.png and odometry.rrd: the way on the road, and curves
     stated        stated poses at the times of frames, and common mistakes in them, undone one by one
     compare       stated poses against the measured motion, and the check of `bevcli project-debug`
 """

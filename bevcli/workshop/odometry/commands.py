@@ -31,11 +31,11 @@ def odometry(
     the same for `bevcli viz`. A drive with more than 15 frames per second is thinned to 10, unless --rate or --every
     is given. Nothing in SEQUENCE is changed. `bevcli run SEQUENCE --odometry` measures first and then runs a model.
     """
-    from bevcli.workshop.odometry import compare, drives, measure, picture, recording, report
+    from bevcli.workshop.odometry import compare, measure, picture, report
 
     input_options = replace(source, ego_motion="measured")
     opened = bevcli.open_sequence(sequence, input_options, ground_truth=False, **format_options)
-    drive = picture.WatchedDrive(opened if source.rate_hz or source.every else drives.at_most_rate(opened))
+    drive = picture.WatchedDrive(opened if source.rate_hz or source.every else report.at_most_rate(opened))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")
     with Progress(len(drive.stamps) - 1, "steps", drive.notes) as progress:
@@ -48,7 +48,7 @@ def odometry(
     written = report.write_report(motion, out, difference, findings)
     road = picture.stitched(drive, motion.poses)
     picture.write_picture(out / "odometry.png", motion, road, stated_poses)
-    recording.write_recording(out / "odometry.rrd", motion, drive, road, stated_poses)
+    picture.write_recording(out / "odometry.rrd", motion, drive, road, stated_poses)
     written += [out / "odometry.png", out / "odometry.rrd"]
     say((report.to_json if as_json else report.report_text)(motion, difference, findings))
     say("Written: " + ", ".join(map(str, written)), err=as_json)

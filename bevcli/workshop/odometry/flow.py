@@ -9,7 +9,7 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.correspondence.residuals import GroupGeometry, Indices, Residuals, rays_of_road_points
 from bevcli.workshop.correspondence.road import contrast, flow_at
-from bevcli.workshop.odometry.views import BEGIN_M, CELL_M, SHAPE, RoadPicture, moved_picture
+from bevcli.workshop.odometry.step_views import BEGIN_M, CELL_M, SHAPE, RoadPicture, moved_picture
 
 SPACING, WINDOW = 8, 21  # cells: between points of the flow, and the side of what is compared
 PIXEL = 0.5  # standard deviation of a direction, pixels

@@ -21,14 +21,15 @@ from bevcli.workshop.odometry.step_views import (
     COUNT,
     SLOPE_RAD,
     SLOPES,
+    FrameView,
     StepViews,
+    Viewer,
     exponential,
     logarithm,
     motion_of,
     next_slopes,
 )
 from bevcli.workshop.odometry.steps import NOT_TOLD, Candidate, Guess, SeenPoints, candidates, is_measured, reason_of
-from bevcli.workshop.odometry.views import FrameView, Viewer
 
 LEAPS = "its length contradicts the steps before and after, and few points of the road match"
 SUBSTEP_NS = 25_000_000  # between the poses of `MeasuredMotion.ego_motion`

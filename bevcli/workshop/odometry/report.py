@@ -5,7 +5,7 @@ Functions of a `MeasuredMotion`, and the files that `bevcli odometry` writes of 
 
 import json
 from collections import Counter
-from collections.abc import Sequence as Items
+from collections.abc import Iterator, Sequence as Items
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,10 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
 from bevcli.findings import Finding
+from bevcli.frame import Drive
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.printing import aligned, counted
+from bevcli.sequences.view import DriveView, select, select_rate
 from bevcli.workshop.formats.output import write_ego_motion
-from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep
+from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.writing import write_whole
 
 KMH = 3.6
@@ -216,3 +219,49 @@ def write_report(
     write_whole(report, f"{to_json(motion, stated, findings)}\n".encode(), parents=True)
     write_ego_motion(poses, motion.ego_motion)
     return [poses, report]
+
+
+MOST_RATE_HZ = 10.0  # a faster drive is measured at this rate: shorter steps cost time and add errors
+FASTER = 1.5  # times this rate is thinned to it
+
+
+def with_measured_motion(drive: Drive, whole: Drive) -> Iterator[tuple[int, int] | DriveView]:
+    """The number of steps that are measured and of all, scene by scene; at the end, the drive with that motion.
+
+    A note of each scene states the motion.
+
+    Args:
+        drive: the frames that are used.
+        whole: a drive with further frames: those between the first and the last one of a scene are measured too.
+
+    Raises InputError where not one step of a scene can be measured.
+    """
+    motions, notes = dict[str, EgoMotion](), list[str]()
+    for scene in dict.fromkeys(stamp.scene for stamp in drive.stamps):
+        between = at_most_rate(frames_between(drive, whole, scene))
+        steps, total = list[MeasuredStep](), len(between.stamps) - 1
+        if total:
+            yield 0, total
+        for step in measure_steps(between):
+            steps.append(step)
+            yield len(steps), total
+        motion = MeasuredMotion.of(between, steps)
+        check_measured(motion)
+        motions[scene] = motion.ego_motion
+        notes.append(measured_note(motion))
+    yield DriveView(drive, motions=motions, notes=tuple(notes))
+
+
+def frames_between(drive: Drive, whole: Drive, scene: str) -> Drive:
+    """The frames of `whole` from the first to the last frame of `drive` in a scene."""
+    times = [stamp.timestamp_ns for stamp in drive.stamps if stamp.scene == scene]
+    between = [stamp.scene == scene and times[0] <= stamp.timestamp_ns <= times[-1] for stamp in whole.stamps]
+    return select(whole, np.flatnonzero(between).tolist())
+
+
+def at_most_rate(drive: Drive) -> Drive:
+    """The drive, thinned to MOST_RATE_HZ where its frames follow each other faster."""
+    steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps])
+    if not len(steps) or np.median(steps) * FASTER * MOST_RATE_HZ > 1e9:
+        return drive
+    return select_rate(drive, MOST_RATE_HZ)

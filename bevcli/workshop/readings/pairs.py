@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 from bevcli.frame import Drive
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.correspondence.images import GreyImage, grey_image, reduced
-from bevcli.workshop.correspondence.points import FEWEST_IN_PAIR, Features, features, matched
+from bevcli.workshop.correspondence.points import (
+    FEWEST_IN_PAIR,
+    Features,
+    GreyImage,
+    features,
+    grey_image,
+    matched,
+    reduced,
+)
 
 WIDTH = 800  # pixels of the reduced images
 SHORTEST_M, LONGEST_M = 0.7, 12.0  # of a step between two frames

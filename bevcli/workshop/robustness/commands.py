@@ -15,8 +15,8 @@ from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions
 from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.robustness.options import StressOptions, StressOutputOptions
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.robustness import StressOptions, StressOutputOptions
+from bevcli.workshop.synth import DriveOptions
 
 PANEL = "Score"
 

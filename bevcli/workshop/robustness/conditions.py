@@ -18,7 +18,7 @@ from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, camera_pose_nois
 from bevcli.geometry.ego_motion import motion_during
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.view import select
-from bevcli.workshop.robustness.options import LostImage, SeverityChoice
+from bevcli.workshop.robustness import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels
 from bevcli.workshop.synth.rig import tilt

@@ -25,12 +25,12 @@ from bevcli.runs.state import DIGITS, digest, load_state, run_fingerprint, save_
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import DriveView, scenes_of, select, select_range
 from bevcli.workshop.calibration.calibrate import calibrate
+from bevcli.workshop.robustness import StressOptions
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
-from bevcli.workshop.robustness.options import StressOptions
 from bevcli.workshop.scores.detection import evaluate_detections, known_mean
 from bevcli.workshop.scores.evaluate import finite
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames, RenderedDrives
-from bevcli.workshop.synth.options import DriveOptions
 from bevcli.writing import write_whole
 
 RESULTS, FORMAT = "stress.json", "bevcli-stress/1"

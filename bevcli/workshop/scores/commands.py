@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.printing import print_note, say
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.scores.options import EvaluationOptions, ResultOptions
+from bevcli.workshop.scores import EvaluationOptions, ResultOptions
 from bevcli.workshop.scores.tables import write_csv, write_latex
 
 PANEL = "Score"

@@ -19,9 +19,8 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nu
 from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.workshop.scores import inputs
+from bevcli.workshop.scores import ResultOptions, inputs
 from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
-from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.plots import write_plots
 from bevcli.workshop.scores.tables import Cell, Table
 from bevcli.workshop.scores.tracking import TrackingScores, score_tracks

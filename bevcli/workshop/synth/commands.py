@@ -12,7 +12,7 @@ from bevcli.recording.options import RecordingOptions
 from bevcli.runs.options import OutputOptions, RunOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer.options import ViewOptions
-from bevcli.workshop.synth.options import DemoOptions, RenderOptions
+from bevcli.workshop.synth import DemoOptions, RenderOptions
 
 PANEL = "Start"
 DEMO_RESOLUTION = (800, 450)

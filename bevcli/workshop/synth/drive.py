@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lsim
 
 from bevcli.frame import BevMap, CameraImage, DriveFacts, Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -22,19 +23,64 @@ from bevcli.options import gather
 from bevcli.parsing.images import encode_image
 from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.formats.output import NativeWriter, write_ego_motion
-from bevcli.workshop.synth.body import MIDDLE, BodyMotion
+from bevcli.workshop.synth import JPEG_QUALITY, RenderOptions
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
 from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
 from bevcli.workshop.synth.material import Coats, MaterialFolder, PhotoLooks
 from bevcli.workshop.synth.mesh import TriangleSoup
-from bevcli.workshop.synth.options import JPEG_QUALITY, RenderOptions
 from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
-from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering
+from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering, tilt
 from bevcli.workshop.synth.scenery import Scenery
 from bevcli.workshop.synth.simulation import Actor, Density, Simulation, draw_density
-from bevcli.workshop.synth.traffic import ActorState
+from bevcli.workshop.synth.traffic import ActorState, EgoTrack
+
+MOST_DEG = (1.5, 1.0)  # pitch and roll
+MOST_HEAVE_M = 0.03
+MIDDLE = np.array([1.4, 0.0, 0.0])  # of the turn, in the ego frame, metres
+STEP_S = 0.01
+SPRING_HZ, DAMPING = 1.3, 0.35
+NOD_DEG, LEAN_DEG = (0.12, 0.30), (0.15, 0.35)  # of pitch and roll for each m/s², lowest and highest of the vehicles
+LOAD_DEG = (0.4, 0.25)  # standard deviations
+WAVES_M = (5, 200, 12)  # shortest and longest wave of the road, and their number
+SHORT_M = 25.0  # waves that are shorter come of an uneven road, longer ones of its slopes and crowns
+UNEVEN_DEG, SLOPE_DEG = 0.1, 0.2  # standard deviations of each wave
+UNEVEN_M = 0.004  # the same of the heave
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Tilt and heave of the body at times after the start of a drive, over a vehicle that stands on a level road."""
+
+    times: Array  # (T,) seconds
+    turns: Array  # (T, 2) pitch, positive with the nose down, and roll, positive with the right side down; radians
+    heaves: Array  # (T,) metres
+
+    @staticmethod
+    def draw(ego: EgoTrack, random: np.random.Generator) -> "BodyMotion":
+        """The motion of a vehicle on its way, with springs, a load and a road that are drawn at random."""
+        times = np.arange(ego.track[0, 0], ego.track[0, -1], STEP_S)
+        way, speeds = (np.interp(times, ego.track[0], row) for row in ego.track[1:])
+        gains = [random.uniform(*range_deg) for range_deg in (NOD_DEG, LEAN_DEG)]
+        forward, left = np.gradient(speeds, STEP_S), speeds * np.gradient(ego.route.yaw_at(way), STEP_S)
+        own = 2 * np.pi * SPRING_HZ
+        spring = ([own**2], [1, 2 * DAMPING * own, own**2])
+        swings = [lsim(spring, pull, times - times[0])[1] for pull in (-gains[0] * forward, gains[1] * left)]
+        lengths, roughness = np.geomspace(*WAVES_M), random.uniform(0.3, 1.3)
+        waves = np.sin(2 * np.pi * (way[:, None, None] / lengths + random.random((3, len(lengths)))))  # (T, 3, waves)
+        heights_deg = np.sqrt(2) * roughness * np.where(lengths < SHORT_M, UNEVEN_DEG, SLOPE_DEG)
+        turns_deg = np.stack(swings, -1) + random.normal(0, LOAD_DEG) + waves[:, :2] @ heights_deg
+        turns = np.radians(MOST_DEG * np.tanh(turns_deg / MOST_DEG))
+        heaves = waves[:, 2] @ np.full(len(lengths), UNEVEN_M * roughness)
+        return BodyMotion(times, turns, MOST_HEAVE_M * np.tanh(heaves / MOST_HEAVE_M))
+
+    def level_from_body(self, time_s: float) -> Array:
+        """(4, 4) from the ego frame to that of the vehicle on a level road with its springs at rest, metres."""
+        pitch, roll, heave = (np.interp(time_s, self.times, x) for x in (*self.turns.T, self.heaves))
+        turn = tilt(pitch, roll)
+        return rigid(MIDDLE + (0, 0, heave)) @ rigid(-turn @ MIDDLE, turn)
+
 
 ANNOTATED_M = 60.0  # boxes are kept within this distance of the origin of the bev frame
 ACTORS_M = 66.0  # actors are drawn within this distance

@@ -24,10 +24,10 @@ from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.sequences.open import open_sequence, open_steps
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive
 from bevcli.workshop.synth.material import MaterialFolder
-from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
 from bevcli.writing import write_whole
 

@@ -18,7 +18,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, Distortion, default_ego_from_bev, fisheye_table
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration
-from bevcli.workshop.synth.options import Body
+from bevcli.workshop.synth import Body
 
 WIDEST = 4.0  # tangent of the widest angle off the optical axis in one pinhole image; wider ones would be too large
 SMALLEST_ANGLE = np.arctan(WIDEST)  # a lens model that ends inside the image, at a smaller angle, is a mistake

@@ -15,8 +15,8 @@ from bevcli.errors import InputError
 from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.printing import counted, print_note, say
 from bevcli.runs.options import RunOptions
-from bevcli.workshop.synth.options import DriveOptions
-from bevcli.workshop.training.options import ModelFileOptions, TrainOptions, ValidationOptions
+from bevcli.workshop.synth import DriveOptions
+from bevcli.workshop.training import ModelFileOptions, TrainOptions, ValidationOptions
 
 if TYPE_CHECKING:
     from bevcli.inference.load import Model

@@ -22,12 +22,12 @@ from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.folder import OWN, folder_lock
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
-from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
+from bevcli.workshop.training import Log, TrainOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.frame_losses import LossConfigs
-from bevcli.workshop.training.options import Log, TrainOptions
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.validation import check_training_drives, require_tensorboard
 from bevcli.workshop.training.warm_start import WarmStart, start_backbone, warm_start

@@ -29,10 +29,10 @@ from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.view import scenes_of, select_rate
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import read_split
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training import Preset, TrainOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training
-from bevcli.workshop.training.options import Preset, TrainOptions
 from bevcli.workshop.training.targets import ground_truth_boxes
 from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.training.validation import longest_scene

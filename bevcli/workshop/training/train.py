@@ -11,6 +11,7 @@ from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.options import refuse, spread
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import (
     Drives,
     FolderDrives as FolderDrives,
@@ -18,9 +19,8 @@ from bevcli.workshop.synth.drives import (
     read_split,
     scored_drives,
 )
-from bevcli.workshop.synth.options import DriveOptions
+from bevcli.workshop.training import TrainOptions, ValidationOptions
 from bevcli.workshop.training.job import prepare_training, rig_for_drives
-from bevcli.workshop.training.options import TrainOptions, ValidationOptions
 from bevcli.workshop.training.trainer import WEIGHTS, Trainer
 from bevcli.workshop.training.validation import Validation, check_scored_drives, validate as validate_runner
 

@@ -34,8 +34,8 @@ from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs
 from bevcli.workshop.scores.tracking import score_tracks
+from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FRAMES_PER_DRIVE, Drives
-from bevcli.workshop.synth.options import DriveOptions
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.writing import output_errors, whole_file
 

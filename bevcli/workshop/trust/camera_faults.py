@@ -20,7 +20,7 @@ from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.points import matched
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
 from bevcli.workshop.odometry.stated import Poses
-from bevcli.workshop.odometry.views import FrameView
+from bevcli.workshop.odometry.step_views import FrameView
 
 LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera

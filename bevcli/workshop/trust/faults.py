@@ -25,7 +25,7 @@ from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.view import select
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.stated import Poses
-from bevcli.workshop.odometry.views import Viewer
+from bevcli.workshop.odometry.step_views import Viewer
 from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
 from bevcli.workshop.trust.witness import load_witness

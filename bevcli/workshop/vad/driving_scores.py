@@ -20,8 +20,8 @@ from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
 from bevcli.sequences.nuscenes import is_nuscenes_root
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, FrameLines, LinesFile, MapLines, read_lines
+from bevcli.workshop.scores import ResultOptions
 from bevcli.workshop.scores.inputs import Compared, FramePairs, ScoredInput
-from bevcli.workshop.scores.options import ResultOptions
 from bevcli.workshop.scores.tables import Table
 from bevcli.workshop.vad import driving_metrics as metrics
 from bevcli.workshop.vad.plan import Plan, read_plans
