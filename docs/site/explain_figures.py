@@ -21,6 +21,7 @@ from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
 from numpy.typing import NDArray
 
 import bevcli
+from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.geometry.transforms import apply, inverse, rotation_about_z
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.decoder import boxes_of_codes
@@ -45,7 +46,6 @@ CAN_BUS = (  # names, unit, colour
     (["heading"], "rad", "#c2185b"),
     (["heading change"], "°", "#0f766e"),
 )
-SCORE = 0.3  # boxes below this are not drawn
 VISIBILITY = 0.2  # true boxes below this are not drawn
 PARTS = ("neck", "pillars", "bev_queries", "encoder", "decoder", "segmentation_head")
 
@@ -80,7 +80,7 @@ class Trace:
         self.history = self.as_map(self.calls["encoder"][1]["history"][0])
         self.can_bus = self.calls["bev_queries"][0][0][0].numpy()
         self.shift = self.calls["encoder"][1]["shift"][0].numpy()
-        self.boxes = self.prediction.boxes.scored(SCORE)
+        self.boxes = self.prediction.boxes.scored(SHOWN_SCORE)
         visible = self.network.pillars.project(*self.calls["pillars"][0]).visible[0].numpy()
         self.visible = visible.reshape(len(self.cameras), self.grid.rows, self.grid.columns, -1)
         self.extent_m = np.diff([self.grid.x_range_m, self.grid.y_range_m])[:, 0]
@@ -397,7 +397,7 @@ def temporal_attention(trace: Trace) -> Figure:
     panels = [bev_axes(figure.add_subplot(spec[i]), trace, title, y_labels=i == 0) for i, title in enumerate(titles)]
     now, history, aligned = colors_of([trace.layers[-1], trace.as_map(before.bev), trace.history])
     show(panels[0], trace, history)
-    boxes(panels[0], before.boxes.scored(SCORE), INK, style="--", halo=True)
+    boxes(panels[0], before.boxes.scored(SHOWN_SCORE), INK, style="--", halo=True)
     (x0, x1), (y0, y1) = trace.grid.x_range_m, trace.grid.y_range_m
     extent = (x0 - moved[0], x1 - moved[0], y0 - moved[1], y1 - moved[1])
     panels[1].imshow(aligned, extent=extent, origin="lower", interpolation="nearest", zorder=0)
@@ -447,7 +447,7 @@ def recurrence(trace: Trace) -> Figure:
         camera(figure.add_subplot(spec[0, column]), frame, front, title)
         axes = bev_axes(figure.add_subplot(spec[1, column]), trace, y_labels=column == 0)
         show(axes, trace, image)
-        boxes(axes, prediction.boxes.scored(SCORE), INK, halo=True)
+        boxes(axes, prediction.boxes.scored(SHOWN_SCORE), INK, halo=True)
         if column:
             arrow = {"arrowstyle": "simple,head_width=1.1,head_length=0.8", "fc": ORANGE, "ec": "white"}
             axes.annotate("", (0.0, 0.5), (-0.13, 0.5), xycoords="axes fraction", zorder=30, arrowprops=arrow)
@@ -456,8 +456,8 @@ def recurrence(trace: Trace) -> Figure:
 
 def decoder(trace: Trace) -> Figure:
     scores, points = trace.scores, trace.places
-    chosen = np.flatnonzero(scores[-1].max(-1) >= SCORE)
-    subtitle = f"{points.shape[1]} queries. Coloured: the {len(chosen)} with a final score of at least {SCORE:g}."
+    chosen = np.flatnonzero(scores[-1].max(-1) >= SHOWN_SCORE)
+    subtitle = f"{points.shape[1]} queries. Coloured: the {len(chosen)} with a final score of at least {SHOWN_SCORE:g}."
     figure = titled(7.35, "Object decoder: reference points move to the objects", subtitle)
     spec = figure.add_gridspec(1, 2, wspace=0.1, bottom=0.075)
     axes = bev_axes(figure.add_subplot(spec[0]), trace, "Reference points from the start to the last layer")
@@ -469,7 +469,7 @@ def decoder(trace: Trace) -> Figure:
         dots = {"color": ORANGE, "alpha": shade, "ms": 7 if layer == len(scores) else 4.5, "zorder": 5}
         axes.plot(*points[layer, chosen].T, "o", label=f"after layer {layer}", **dots)
     axes.legend(loc="lower right", fontsize=11)
-    title = f"Boxes with a score of at least {SCORE:g}; arrows: velocity"
+    title = f"Boxes with a score of at least {SHOWN_SCORE:g}; arrows: velocity"
     axes = bev_axes(figure.add_subplot(spec[1]), trace, title)
     truth(axes, trace)
     boxes(axes, trace.boxes, ORANGE, width=2.0)
@@ -487,7 +487,7 @@ def decoder(trace: Trace) -> Figure:
 
 def box_code(trace: Trace) -> Figure:
     scores, codes, points = trace.scores, trace.codes, trace.places
-    distances = np.where(scores[-1].max(-1) >= SCORE, np.hypot(*(codes[-1, :, :2] - trace.center).T), np.inf)
+    distances = np.where(scores[-1].max(-1) >= SHOWN_SCORE, np.hypot(*(codes[-1, :, :2] - trace.center).T), np.inf)
     query = int(np.where(distances < distances.min() + 0.5, scores[-1].max(-1), 0).argmax())
     label = int(scores[-1, query].argmax())
     name, code = trace.network.config.classes[label], codes[:, query]

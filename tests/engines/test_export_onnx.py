@@ -15,6 +15,7 @@ from small_model import check_file, model_for_engines, small_config, small_input
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, WeightsError
+from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
 from bevcli.model.bevformer.bevformer import BEVFormer
@@ -212,7 +213,7 @@ def test_the_deployment_pages_program_finds_the_boxes_of_bevcli(demo_file, tmp_p
     assert len(lines) == len(expected)
     for line, boxes in zip(lines, expected, strict=True):
         _, count, best = line.split(maxsplit=2)
-        assert int(count) == (boxes.scores > 0.3).sum()
+        assert int(count) == len(boxes.scored(SHOWN_SCORE))
         np.testing.assert_allclose(json.loads(best)[:3], boxes.centers[0], atol=0.02)
 
 

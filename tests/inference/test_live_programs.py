@@ -15,6 +15,7 @@ import pytest
 from memory_drive import MemoryDrive, make_rig
 
 import bevcli
+from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.geometry.transforms import rigid, rotation_about_z
 
 PAGE = (Path(__file__).parents[2] / "docs/live.md").read_text()
@@ -54,7 +55,7 @@ class Stream:
 
     def __init__(self, source):
         self.opened.append(source)
-        self.left = 3 if source == "rtsp://back" else 10**9
+        self.left = 10**9 if source == 0 else 3 * (self.opened.count(source) == 1)
 
     def read(self):
         if Stream.over:
@@ -177,7 +178,7 @@ def test_the_node_publishes_the_boxes_of_a_session(model, rig, ros):
     assert [one.results[0].hypothesis.class_id for one in found.detections] == boxes.classes.tolist()
     assert node.session.frame.kinematics.velocity == pytest.approx(session.frame.kinematics.velocity)
     assert page.nanoseconds(node.sent[-1].header) == expected.stamp.timestamp_ns
-    assert len(node.sent[-1].detections) == (boxes.scores >= 0.3).sum()
+    assert len(node.sent[-1].detections) == len(boxes.scored(SHOWN_SCORE))
     assert sum(map(bool, PROGRAMS["bevcli_node"].splitlines())) <= 88
 
 
