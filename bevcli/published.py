@@ -147,7 +147,7 @@ class NamedWeights:
         """Store the hash of a file that was downloaded. Raises OutputError."""
         hashes = {**_read_hashes(self.folder), self.source.source: known}
         content = msgspec.json.format(msgspec.json.encode(hashes), indent=1)
-        write_whole(self.folder / HASHES, content + b"\n", parents=True, shared=True)
+        write_whole(self.folder / HASHES, content + b"\n", parents=True)
 
 
 @dataclass(frozen=True)

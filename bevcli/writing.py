@@ -4,17 +4,20 @@ And the folders of a user, as the XDG base directory specification has them.
 """
 
 import os
+import platform
 import shutil
 import sys
 import uuid
 import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from bevcli.errors import OutputError
 
 PARTIAL = ".partial"  # ends the name of a file while it is written
+UNFINISHED = ".unfinished-"  # begins it; then machine and process
 NO_HOME = Path("/nonexistent")  # as in the passwd of Debian; caches that cannot be written are done without
 
 
@@ -46,22 +49,22 @@ def lock(descriptor: int) -> bool:
 
 
 @contextmanager
-def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regular: bool = False) -> Iterator[Path]:
+def whole_file(path: Path, *, parents: bool = False, regular: bool = False) -> Iterator[Path]:
     """A path to write to, in the folder of `path`.
 
         with whole_file(out) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
 
     At the end of the block the file takes the place of `path`, also of a link. After an error it is deleted, and `path`
-    stays as it was. A device or a pipe, and what is in /dev, is written directly.
+    stays as it was. Several processes may write the file at the same time: the last one wins. What killed processes
+    left is deleted. A device or a pipe, and what is in /dev, is written directly.
 
-    parents: make the folders that are missing. shared: several processes may write the file at the same time. Else
-    its unfinished name is always the same, so that killed processes leave one such file at most. regular: the file
-    takes the place of a pipe too: a pipe that somebody has put there would be waited for.
+    parents: make the folders that are missing. regular: the file takes the place of a pipe too: a pipe that somebody
+    has put there would be waited for.
     Raises OutputError where the file cannot be written; every OSError of the block counts as this.
     """
-    mark = uuid.uuid4().hex[:8] if shared else f"{zlib.crc32(os.fsencode(path.name)):08x}"
-    unfinished = path.with_name(f".unfinished-{mark}{path.suffix}")
+    machine = f"{UNFINISHED}{zlib.crc32(platform.node().encode()):08x}-"
+    unfinished = path.with_name(f"{machine}{os.getpid()}-{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         with output_errors(path):
             if not regular and (path.is_relative_to("/dev") or (path.exists() and not path.is_file())):
@@ -69,7 +72,7 @@ def whole_file(path: Path, *, parents: bool = False, shared: bool = False, regul
                 return
             if parents:
                 path.parent.mkdir(parents=True, exist_ok=True)
-            unfinished.unlink(missing_ok=True)  # it may be a link
+            _remove_abandoned_once(path.parent, machine)
             unfinished.touch(exist_ok=False)
             mode = unfinished.stat().st_mode & 0o777  # that the umask gives to new files
             unfinished.unlink()
@@ -85,6 +88,19 @@ def write_whole(path: Path, content: bytes, **how: bool) -> None:
     """Write a file, so that readers see the old or the new contents. how: of `whole_file`."""
     with whole_file(path, **how) as unfinished:
         unfinished.write_bytes(content)
+
+
+def remove_abandoned(folder: Path, prefix: str) -> None:
+    """Delete what ended processes left in a folder: a name is the prefix, the number of the process, perhaps "-…"."""
+    for path in folder.glob(f"{prefix}*") if sys.platform != "win32" else ():  # there, os.kill would end a process
+        with suppress(ValueError, OverflowError, OSError):
+            try:
+                os.kill(int(path.name.removeprefix(prefix).partition("-")[0]), 0)
+            except ProcessLookupError:
+                remove_parts(folder, [path.name])
+
+
+_remove_abandoned_once = cache(remove_abandoned)  # a folder may hold thousands of files
 
 
 def remove_parts(folder: Path, parts: Iterable[str]) -> None:

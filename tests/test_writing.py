@@ -1,12 +1,15 @@
 """A file has its old or its new contents, whatever happens while it is written."""
 
+import multiprocessing
 import os
+import signal
 import threading
+from pathlib import Path
 
 import pytest
 
 from bevcli.errors import OutputError
-from bevcli.writing import check_output, whole_file, write_whole
+from bevcli.writing import _remove_abandoned_once, check_output, whole_file, write_whole
 
 
 def test_a_written_file_has_its_name_and_leaves_nothing_else(tmp_path):
@@ -40,24 +43,35 @@ def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_left_is_replaced_unfollowed(tmp_path):
-    path, target = tmp_path / "file.txt", tmp_path / "target"
-    with whole_file(path) as left:
-        left.write_text("old")
-    target.write_text("stays")
-    left.symlink_to(target)
+def kill_while_it_writes(path):
     with whole_file(path) as unfinished:
+        unfinished.write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_a_killed_process_left_is_deleted(tmp_path):
+    path = tmp_path / "file.txt"
+    process = multiprocessing.get_context("fork").Process(target=kill_while_it_writes, args=(path,))
+    process.start()
+    process.join()
+    [left] = tmp_path.iterdir()
+    (tmp_path / f"{left.name}.link").symlink_to(__file__)
+    with whole_file(path) as unfinished:
+        assert not left.exists()
         unfinished.write_text("new")
-    assert unfinished == left
-    assert (path.read_text(), target.read_text()) == ("new", "stays")
-    assert sorted(tmp_path.iterdir()) == [path, target]
+    assert list(tmp_path.iterdir()) == [path]
+    assert Path(__file__).exists()
 
 
-def test_processes_that_share_a_file_have_names_of_their_own(tmp_path):
-    with whole_file(tmp_path / "a", shared=True) as one, whole_file(tmp_path / "a", shared=True) as other:
-        assert one != other
-        one.touch()
-        other.touch()
+def test_two_processes_that_write_a_file_each_write_the_whole(tmp_path):
+    with whole_file(tmp_path / "a") as one:
+        one.write_text("one")
+        _remove_abandoned_once.cache_clear()  # as in another process
+        with whole_file(tmp_path / "a") as other:
+            other.write_text("other")
+        assert (tmp_path / "a").read_text() == "other"
+    assert (tmp_path / "a").read_text() == "one"
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
 
 
 def test_a_link_is_replaced_and_its_target_stays(tmp_path):

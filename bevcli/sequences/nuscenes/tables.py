@@ -38,7 +38,7 @@ from bevcli.sequences.nuscenes.index import (
     Scenes,
     Sensors,
 )
-from bevcli.writing import user_cache
+from bevcli.writing import UNFINISHED, remove_abandoned, user_cache
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20
@@ -422,8 +422,8 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
 
 def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     """Write to a temporary folder, then rename it, so that an interrupted run leaves no incomplete index."""
-    unfinished = folder.with_name(f"{folder.name}.{os.getpid()}")
-    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished = folder.with_name(f"{folder.name}{UNFINISHED}{os.getpid()}")
+    remove_abandoned(folder.parent, f"{folder.name}{UNFINISHED}")
     unfinished.mkdir(parents=True)
     for group, table in vars(index).items():
         for name, values in vars(table).items():

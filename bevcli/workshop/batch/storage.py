@@ -107,7 +107,7 @@ class LocalFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file. Readers see the old or the new contents. Raises OutputError."""
-        write_whole(self.path / name, content, parents=True, shared=True)
+        write_whole(self.path / name, content, parents=True)
 
     def remove(self, name: str) -> None:
         """Remove a file or a subfolder, if it is there. Raises OutputError."""

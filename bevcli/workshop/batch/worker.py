@@ -40,6 +40,7 @@ from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
 from bevcli.workshop.scores.evaluate import Scores, evaluate
 from bevcli.workshop.trust.estimate import agreement_of_run
+from bevcli.writing import remove_abandoned
 
 _SCRATCH = "bevcli-batch-"
 
@@ -51,7 +52,7 @@ class Worker:
         self._job, self._job_hash = job, job_hash
         self._out = storage.open_storage(job.out)
         self._model = job.load_model() if model is None else model
-        _remove_scratch_of_dead_workers()
+        remove_abandoned(Path(tempfile.gettempdir()), _SCRATCH)
 
     def run(self, drive: BatchDrive) -> Iterator[Record | None]:
         """Run a drive until it is done or has failed too often: yield None after each frame, then its stored record.
@@ -247,17 +248,6 @@ def _read_marker(content: bytes | None) -> tuple[int, str]:
         return msgspec.json.decode(content or b'[0, ""]', type=tuple[int, str])
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return 0, ""
-
-
-def _remove_scratch_of_dead_workers() -> None:
-    for folder in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*-*"):
-        pid = folder.name.removeprefix(_SCRATCH).partition("-")[0]
-        try:
-            os.kill(int(pid), 0)
-        except ProcessLookupError:
-            shutil.rmtree(folder, ignore_errors=True)
-        except (ValueError, OSError):
-            continue
 
 
 OBJECT_STORE_BYTES = 100 << 20  # it holds a drive and a record per worker

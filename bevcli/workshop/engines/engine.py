@@ -374,14 +374,14 @@ class CachedFile:
     def written(self) -> Iterator[Path]:
         """A path for the contents of the file, which takes its place after the block. Raises OutputError."""
         _remove_unused(self.path.parent)
-        with whole_file(self.path, parents=True, shared=True) as unfinished:
+        with whole_file(self.path, parents=True) as unfinished:
             yield unfinished
 
     def opened(self, engine: type[Engine], calibrated_with: str = "") -> CachedNetwork:
         """The file in an engine, after it was written; its facts are kept beside it."""
         network = engine.open(self.path)
         file_facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
-        write_whole(self.facts_path, msgspec.json.encode(file_facts), shared=True)
+        write_whole(self.facts_path, msgspec.json.encode(file_facts))
         return CachedNetwork(network, calibrated_with)
 
 

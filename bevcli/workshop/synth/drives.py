@@ -29,7 +29,7 @@ from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, export_drive
 from bevcli.workshop.synth.material import MaterialFolder
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
-from bevcli.writing import write_whole
+from bevcli.writing import UNFINISHED, remove_abandoned, write_whole
 
 FIRST_HELD_OUT_SEED = 1_000_000  # drives from this seed on are for evaluation only
 FRAMES_PER_DRIVE = 20
@@ -161,8 +161,8 @@ class RenderedDrives(FolderDrives):
             seed, FRAMES_PER_DRIVE, self._config.rate_hz, drawn, assets=self._assets,
             supersampling=drawn.supersampling, map_half_extent_m=half_extent,
         )  # fmt: skip
-        unfinished = folder.with_suffix(f".unfinished-{os.getpid()}")
-        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished = folder.with_suffix(f"{UNFINISHED}{os.getpid()}")
+        remove_abandoned(folder.parent, f"{folder.stem}{UNFINISHED}")
         export_drive(drive, unfinished, quality=drawn.jpeg_quality)
         try:
             os.replace(unfinished, folder)
