@@ -14,7 +14,7 @@ from bevcli.errors import InputError
 from bevcli.sequences.native import holds_videos_alone
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.videos import VideoReader
-from bevcli.workshop.formats.video_times import container_times_ns
+from bevcli.workshop.formats.video_file import container_times_ns
 
 
 def write_video(path, images, rate, codec="FFV1"):

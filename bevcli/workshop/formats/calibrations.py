@@ -22,6 +22,7 @@ from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
 from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
 from bevcli.sequences.files.readings import RigReading
 from bevcli.sequences.options import RigOptions
+from bevcli.workshop.formats.camera_names import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.camera_poses import (
     Cameras,
     Fields,
@@ -31,19 +32,18 @@ from bevcli.workshop.formats.camera_poses import (
     raised,
     rig_readings,
 )
-from bevcli.workshop.formats.first_images import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.information_files import is_information, read_information
+from bevcli.workshop.formats.kitti_drive import KITTI_FILES, read_kitti
 from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
 from bevcli.workshop.formats.other_calibrations import (
-    KITTI_FILES,
     is_colmap,
     is_nerfstudio,
     read_colmap,
-    read_kitti,
     read_nerfstudio,
+    read_vins_fusion,
+    vins_files,
 )
-from bevcli.workshop.formats.vins_fusion import main_files, read_vins_fusion
 
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera
@@ -324,7 +324,7 @@ def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str
 # What a file is -> whether a path is it, and its reader. The first that fits is taken.
 KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cameras]]] = {
     "information file of BEVDet or mmdetection3d": (is_information, read_information),
-    "VINS-Fusion": (lambda path: bool(main_files(path)), read_vins_fusion),
+    "VINS-Fusion": (lambda path: bool(vins_files(path)), read_vins_fusion),
     "COLMAP": (is_colmap, read_colmap),
     "nerfstudio": (is_nerfstudio, read_nerfstudio),
     "KITTI": (

@@ -7,13 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.frame import FrameStamp
-from bevcli.geometry.ego_motion import nearest
+from bevcli.geometry.ego_motion import EgoMotion, nearest
+from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
 
 FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
 GAP = 1.5  # periods from an image to the next where one was lost
 MOST_LOST = 1000  # images in a row; a longer gap is a hole in the recording
 SAME_RATE = 0.1  # measured periods that differ by less are the same
+Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understood
 
 
 @dataclass(frozen=True)
@@ -102,3 +104,12 @@ def _without_gaps(images: CameraImages) -> NDArray[np.int64]:
     gaps = np.flatnonzero((steps > GAP * images.period_ns) & (counts <= MOST_LOST))
     lost = [times[gap] + steps[gap] * np.arange(1, counts[gap]) // counts[gap] for gap in gaps]
     return np.sort(np.concatenate([times, *lost]))
+
+
+def covered(found: Found, motion: EgoMotion) -> Found:
+    """The frames that the poses cover, if these are at least half of them; otherwise all, which is an error later."""
+    entries, line = found
+    kept = [entry for entry in entries if motion.covered(entry.times_ns).all()]
+    if len(kept) == len(entries) or 2 * len(kept) < len(entries):
+        return found
+    return tuple(kept), f"{line}; {counted(len(entries) - len(kept), 'frames')} outside of the poses left out"

@@ -1,4 +1,4 @@
-"""The times of images from the numbers in their names, whose unit is found.
+"""The times of images from the numbers in their names, whose unit is found, or from a text beside them.
 
 A number that is a time since 1970 shows its unit by its size. For other numbers, at most one unit gives the rate of a
 camera, 0.5 to 240 Hz: units differ by a factor of 1000. Numbers that may be indices, too, need the poses or the user.
@@ -7,7 +7,7 @@ camera, 0.5 to 240 Hz: units differ by a factor of 1000. Numbers that may be ind
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.ego_motion import EgoMotion
+from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER
+from bevcli.parsing.files import is_there, read_text
 from bevcli.sequences.native import TimeKind
 
 Times = NDArray[np.int64]
@@ -37,6 +39,7 @@ DENSE_STEP, LARGEST_STEP, SPARSE_STEP = 5, 100, 1000  # of indices: surely, poss
 LARGEST_INDEX = 10**9
 SMALLEST_TIMESTAMP = 10**13  # of a lone image: nanoseconds from this value on (hours after 1970), an index below it
 HOURS_FROM_UTC = range(-12, 15)
+TIMES, TIMESTAMPS = "times.txt", "timestamps.txt"  # of KITTI, beside the images
 NUMBER, DECIMAL = re.compile(r"[0-9]+"), re.compile(r"[0-9]+(?:\.[0-9]+)?")
 SECONDS_AND_FRACTION = re.compile(r"(?<!\d)(\d{10})[._-](\d{9}|\d{6}|\d{3})(?!\d)", re.ASCII)
 DATE = re.compile(
@@ -300,3 +303,32 @@ def _extent(values: Mapping[str, Times]) -> int:
 
 def _largest(reading: Reading) -> int:
     return int(max(times.max() for times in reading.values.values()))
+
+
+def listed_times(drive: Path, images: Path, numbers: Iterable[int]) -> tuple[dict[int, int], str] | None:
+    """The time, ns, of each number of a camera's images, and the name of the file; None where no file fits.
+
+    images: the folder of the images. Line n is the time of number n, or of the n-th image where there are as many.
+    """
+    numbers = sorted(numbers)
+    files = (images / TIMESTAMPS, images.parent / TIMESTAMPS, drive / TIMES)
+    file = next((each for each in files if is_there(each)), None)
+    if file is None:
+        return None
+    times = read_times(file).tolist()
+    if len(times) == len(numbers):
+        return dict(zip(numbers, times, strict=True)), file.name
+    return ({number: times[number] for number in numbers}, file.name) if numbers[-1] < len(times) else None
+
+
+def read_times(file: Path) -> NDArray[np.int64]:
+    """(N,) times of the lines of a file, ns: seconds, or dates. Raises InputError."""
+    times = list[int]()
+    for number, line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1):
+        if not (text := line.strip()):
+            continue
+        time = date_ns(text) if ":" in text else scaled_ns(text)
+        if time is None or abs(time) > LARGEST_INTEGER or (times and time <= times[-1]):
+            raise InputError(f'{file}: line {number}: expected a later time in seconds, or a date, found "{text:.40}"')
+        times.append(time)
+    return np.array(times, dtype=np.int64)

@@ -20,13 +20,10 @@ from bevcli.parsing.documents import first_twice, read_json
 from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
-from bevcli.workshop.formats.autoware import urdf_document, with_own_names
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
-from bevcli.workshop.formats.carla import with_sensors_by_name
+from bevcli.workshop.formats.dialects import urdf_document, with_intrinsics_by_name, with_own_names
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
-from bevcli.workshop.formats.orb_slam import with_cameras_apart
 from bevcli.workshop.formats.pose_readings import quaternions_of_angles
-from bevcli.workshop.formats.waymo import with_intrinsics_by_name
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
@@ -120,13 +117,12 @@ def number_of(word: str) -> float | None:
 
 def cameras_of(document: Any, path: Path) -> Cameras:
     """The cameras of a document with their K, D and T by name. Raises InputError, which names `path`."""
-    document = with_sensors_by_name(with_own_names(document, path), path)
+    document = with_own_names(document, path)
     expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
     if isinstance(document, list):
         document = {"cameras": document}
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
-    document = with_cameras_apart(document)
     entries = _value(document, "cameras", "sensors", "cameracalibrations")
     if isinstance(entries, list):
         names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")

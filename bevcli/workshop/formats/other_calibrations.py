@@ -1,7 +1,8 @@
-"""Calibrations of COLMAP (as text), nerfstudio (transforms.json) and KITTI.
+"""Calibrations of COLMAP (as text), nerfstudio (transforms.json) and VINS-Fusion.
 
 COLMAP and nerfstudio have poses of images. They are those of the cameras on the vehicle where each camera has only one;
-in a reconstruction of a drive the cameras move.
+in a reconstruction of a drive the cameras move. VINS-Fusion has the poses of the cameras in one file (`body_T_cam0`),
+and K and D in those beside it that `cam0_calib` names, of a lens of camodocal.
 """
 
 import re
@@ -13,14 +14,21 @@ from typing import Any
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
+from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
 from bevcli.parsing.documents import read_json
-from bevcli.parsing.files import MIB, read_text
+from bevcli.parsing.files import MIB, read_bytes, read_text
 from bevcli.sequences.files.json_fields import parse_numbers, require
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, StatedCamera, StatedPose
-from bevcli.workshop.formats.named_calibration import COEFFICIENTS, lens_fields, lens_of, number_of
+from bevcli.workshop.formats.markup import YAML_BYTES, read_yaml
+from bevcli.workshop.formats.named_calibration import (
+    COEFFICIENTS,
+    cameras_of,
+    files_in,
+    lens_fields,
+    lens_of,
+    number_of,
+)
 
-KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt")
 LARGEST_TEXT = 64 * MIB
 NO_CAMERA = ("", ".", "images")  # folders that are not named after a camera
 SAME_FOCAL = 1.05  # ratio of focal lengths that a program finds for images of one camera
@@ -43,8 +51,9 @@ NERF_MODELS = {
     "simple_pinhole": "plumb_bob",
     "opencv_fisheye": "fisheye",
 }
-# KITTI's Velodyne is 0.76 m ahead of the rear axle and 1.73 m above the road (the data set's drawing of the vehicle).
-EGO_FROM_VELODYNE = rigid((0.76, 0.0, 1.73))
+# VINS-Fusion's names of files, and the lens KANNALA_BRANDT of camodocal with the names here.
+VINS_CALIBRATION, VINS_LINE = re.compile(r"cam(\d+)_calib"), re.compile(rb"^cam\d+_calib\s*:", re.MULTILINE)
+KANNALA_BRANDT = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 
 
 def is_colmap(path: Path) -> bool:
@@ -66,7 +75,7 @@ def read_colmap(path: Path) -> Cameras:
     """The cameras of COLMAP's cameras.txt. images.txt has their poses and names, those of the images' folders."""
     folder = (_colmap_folder(path, "cameras.txt") if path.is_dir() else path.parent) or path
     by_id = {}
-    for number, line in _lines_of(folder / "cameras.txt"):
+    for number, line in lines_of(folder / "cameras.txt"):
         words, where = line.split(), f"{folder / 'cameras.txt'}: line {number}"
         numbers = [number_of(word) for word in words[2:]]
         if len(words) < 4 or None in numbers:
@@ -76,7 +85,7 @@ def read_colmap(path: Path) -> Cameras:
         by_id[words[0]] = replace(_colmap_camera(words[1], numbers[2:], where), size=(numbers[0], numbers[1]))
     poses, ids = dict[str, list[Array]](), dict[str, dict[str, None]]()
     images = folder / "images.txt"
-    lines = list(_lines_of(images, keep_empty=True)) if images.exists() else []
+    lines = list(lines_of(images, keep_empty=True)) if images.exists() else []
     entries = [line.split(maxsplit=9) for _, line in lines[::2]]  # the other lines are points
     camera_of = {words[9]: words[8] for words in entries if len(words) == 10}
     names = _names_of_images(
@@ -129,7 +138,7 @@ def _posed(camera: StatedCamera, poses: list[Array], name: str, direction: Direc
     return replace(camera, pose=StatedPose({"": poses[0]}, direction, axes=axes, name=name))
 
 
-def _lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
+def lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Lines of a text with their numbers, without comments."""
     for number, line in enumerate(read_text(path, LARGEST_TEXT).splitlines(), 1):
         if (line.strip() or keep_empty) and not line.startswith("#"):
@@ -214,75 +223,42 @@ def _nerf_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
     return StatedCamera(matrix, size if None not in size else None, lens)
 
 
-def read_kitti(path: Path) -> Cameras:
-    """The rectified cameras of KITTI: image_02 of calib_cam_to_cam.txt, image_2 of P2 in other files.
+def vins_files(path: Path) -> list[Path]:
+    """The file of VINS-Fusion that names others, or all of a folder; none for another calibration."""
+    files = [path] if path.is_file() else files_in(path)
+    files = [file for file in files if file.suffix.lower() in (".yaml", ".yml")]
+    return [file for file in files if VINS_LINE.search(read_bytes(file, YAML_BYTES))]
 
-    The origin is on the road, below the rear axle. Poses need Tr_velo_to_cam, Tr, or calib_velo_to_cam.txt beside.
-    """
-    file = next((path / name for name in KITTI_FILES if (path / name).exists()), path)
-    rows = _kitti_rows(file)
-    camera0_from_velodyne = _camera0_from_velodyne(rows, file)
-    rectification = next((_row(rows, key, 9, file) for key in ("R_rect_00", "R0_rect", "R_rect") if key in rows), None)
-    rectified_from_camera0 = rigid(rotation=None if rectification is None else rectification.reshape(3, 3))
-    cameras: Cameras = {}
-    for key in rows:
-        if (match := re.fullmatch(r"P(_rect_0)?(\d)", key)) is None:
-            continue
-        projection = _row(rows, key, 12, file).reshape(3, 4)
-        matrix = projection[:, :3]
-        if abs(np.linalg.det(matrix)) < 1e-9:
-            raise InputError(f"{file}: {key}: is singular (expected the projection matrix of a camera)")
-        pose = None
-        if camera0_from_velodyne is not None:
-            camera_from_rectified = rigid(np.linalg.solve(matrix, projection[:, 3]))
-            camera_from_velodyne = camera_from_rectified @ rectified_from_camera0 @ camera0_from_velodyne
-            pose = StatedPose({"": EGO_FROM_VELODYNE @ inverse(camera_from_velodyne)}, "ego_from_camera", exact=True)
-        size = f"S_rect_0{match[2]}"
-        cameras[f"image_{'0' if match[1] else ''}{match[2]}"] = StatedCamera(
-            (matrix / matrix[2, 2]).tolist(),
-            (rows[size][0], rows[size][-1]) if size in rows else None,
-            {"model": "none"},
-            pose,
-        )
-    if not cameras:
-        raise InputError(f"{file}: has no projection matrix (expected P2, or P_rect_02, of KITTI)")
+
+def read_vins_fusion(path: Path) -> Cameras:
+    """The cameras cam0, cam1 of VINS-Fusion. Of several files in a folder, that with most cameras is taken."""
+    rigs = [_vins_cameras(file) for file in vins_files(path)]
+    most = max(map(len, rigs))
+    rig, *others = [rig for rig in rigs if len(rig) == most]
+    if any(other != rig for other in others):
+        names = ", ".join(file.name for file in vins_files(path))
+        raise InputError(f"{path}: has several configurations ({names}): pass one of these files")
+    return cameras_of(rig, path)
+
+
+def _vins_cameras(main: Path) -> dict[str, Any]:
+    document, cameras = read_yaml(main), dict[str, Any]()
+    if not isinstance(document, dict):
+        raise InputError(f"{main}: is no mapping (expected cam0_calib, body_T_cam0 and so on)")
+    for key, name in document.items():
+        if (match := VINS_CALIBRATION.fullmatch(str(key))) is not None:
+            camera = read_yaml(main.parent / Path(str(name)).name)
+            if not isinstance(camera, dict):
+                raise InputError(f"{main}: {key}: {name}: is no mapping (expected K and D of a camera)")
+            pose = f"body_T_cam{match[1]}"
+            stated = {pose: document[pose]} if pose in document else {}
+            cameras[f"cam{match[1]}"] = {**_in_own_names(camera), **stated}
     return cameras
 
 
-def _camera0_from_velodyne(rows: Mapping[str, Array], file: Path) -> Array | None:
-    """(4, 4), of the file or of that beside it; None if there is none."""
-    name = next((key for key in ("Tr_velo_to_cam", "Tr", "Tr_velo_cam") if key in rows), None)
-    if name is not None:
-        matrix = _row(rows, name, 12, file).reshape(3, 4)
-        return rigid(matrix[:, 3], matrix[:, :3])
-    beside = file.parent / "calib_velo_to_cam.txt"
-    if not beside.exists():
-        return None
-    return kitti_transform(beside)
-
-
-def kitti_transform(path: Path) -> Array:
-    """(4, 4) of R and T in one of KITTI's files: calib_imu_to_velo.txt has velodyne_from_imu. Raises InputError."""
-    rows = _kitti_rows(path)
-    return rigid(_row(rows, "T", 3, path), _row(rows, "R", 9, path).reshape(3, 3))
-
-
-def _kitti_rows(path: Path) -> dict[str, Array]:
-    rows = {}
-    for number, line in _lines_of(path):
-        key, colon, text = line.partition(":")
-        numbers = [number_of(word) for word in text.split()]
-        if not colon:
-            raise InputError(f"{path}: line {number}: expected NAME: NUMBERS, as in KITTI")
-        if numbers and None not in numbers:
-            if key.strip() in rows:
-                raise InputError(f"{path}: line {number}: {key.strip():.60} is in the file twice: keep one")
-            rows[key.strip()] = np.array(numbers, dtype=np.float64)
-    return rows
-
-
-def _row(rows: Mapping[str, Array], key: str, count: int, path: Path) -> Array:
-    row = rows.get(key)
-    if row is None or row.size != count or not np.isfinite(row).all():
-        raise InputError(f"{path}: {key}: expected {count} finite numbers, found {0 if row is None else row.size}")
-    return row
+def _in_own_names(camera: dict[str, Any]) -> dict[str, Any]:
+    numbers = camera.get("projection_parameters")
+    if str(camera.get("model_type")).upper() != "KANNALA_BRANDT" or not isinstance(numbers, dict):
+        return camera
+    renamed = {new: numbers.get(name) for name, new in KANNALA_BRANDT.items()}
+    return {**camera, "projection_parameters": None, **renamed}

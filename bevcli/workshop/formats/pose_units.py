@@ -12,7 +12,7 @@ from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.parsing.documents import CsvRow
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.pose_readings import product
-from bevcli.workshop.formats.pose_table import QUATERNION, VECTOR, Table
+from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, VECTOR, Table
 
 LENGTH = re.compile(r"[_\[( ](mm|cm|km)\b")
 METRES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}
@@ -106,7 +106,7 @@ def with_course(table: Table, positions: Array, times_ns: NDArray[np.int64]) -> 
 
     positions: (T, 3) metres. Raises InputError for a vehicle that does not move.
     """
-    if table.has(*QUATERNION) or table.has("yaw") or table.has("heading") or not table.has("time"):
+    if any(table.has(*names) for names in (QUATERNION, MATRIX, ("yaw",), ("heading",))):
         return table
     is_gps = table.has("latitude", "longitude")
     yaws = course(positions[:, :2], times_ns) if is_gps else None

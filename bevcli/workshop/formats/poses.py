@@ -8,8 +8,8 @@ decide; the unit of times follows from the times of the frames. A note says what
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -22,15 +22,15 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin, quaternion_from_rotation
-from bevcli.parsing.documents import CSV_BYTES, LARGEST_INTEGER, CsvRow
-from bevcli.parsing.files import is_there, read_text
+from bevcli.parsing.documents import LARGEST_INTEGER, CsvRow
+from bevcli.parsing.files import is_there
 from bevcli.printing import counted
 from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, FrameTimesNeeded, ReadPoses
 from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.native import TimeKind
 from bevcli.sequences.options import RigOptions
+from bevcli.workshop.formats.kitti_drive import read_oxts
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
-from bevcli.workshop.formats.oxts import read_oxts
 from bevcli.workshop.formats.pose_readings import (
     FASTEST_M_S,
     compared_rows,
@@ -39,7 +39,7 @@ from bevcli.workshop.formats.pose_readings import (
     of_ego,
     quaternions_of_angles,
 )
-from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, TUM, VECTOR, Table, read_table
+from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, TUM, VECTOR, Table, read_column, read_table
 from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
@@ -51,30 +51,6 @@ LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of files of poses.
-
-    Attributes:
-        is_it: whether a table is of this kind.
-        of_camera: whether its poses are those of its first camera, and not of the vehicle.
-    """
-
-    is_it: Callable[[Table], bool]
-    of_camera: bool = False
-
-
-# By name, in the order in which they are tried.
-KINDS = {
-    "KITTI": Kind(lambda table: table.has(*MATRIX), of_camera=True),
-    "EuRoC": Kind(lambda table: table.columns.get("qw", "").startswith("q_rs_")
-                  or (table.separator == "," and table.columns.get("qw") == "")),
-    "TUM": Kind(lambda table: table.separator in (None, "\t") and tuple(table.columns) == TUM),
-    "GPS": Kind(lambda table: table.has("latitude", "longitude")),
-    "CSV": Kind(lambda table: table.has("x", "y")),
-}  # fmt: skip
-
-
 def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     """The poses of a file, and what was understood; None for a file of no known kind.
 
@@ -83,8 +59,8 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     if path.is_dir():
         return read_oxts(path)
     table = read_table(path)
-    name = None if table is None else next((name for name, layout in KINDS.items() if layout.is_it(table)), None)
-    if table is None or name is None:
+    name = "" if table is None else _kind(table)
+    if table is None or not name:
         return None
     table = in_usual_units(table, drive.stated)
     positions, origin = _positions(table)
@@ -95,18 +71,17 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
         line = table.spans[1 + int(late.argmax()), 0]
         raise InputError(f"{path}: line {line}: its time is not later than that of the row before: sort them")
     _check_camera(drive)
-    readings = list(_readings(table, positions, KINDS[name], drive, times))
+    readings = list(_readings(table, positions, drive, times))
     is_stated = any(getattr(drive.stated, option) for option in POSE_STATEMENTS)
     free = replace(drive, stated=RigOptions())
-    others = tuple(_readings(table, positions, KINDS[name], free, times)) if is_stated else ()
+    others = tuple(_readings(table, positions, free, times)) if is_stated else ()
     if not readings:
         raise InputError(
             f"{path}: in no reading of the poses the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
             "correct them, or measure the motion by `odometry=True` (`--odometry`)"
         )
     rate = f" at {1e9 / np.median(np.diff(times)):.1f} Hz" if len(times) > 1 else ""
-    first = f"{name}, {counted(len(times), 'rows')}{rate}, {time_words}"
-    first = ", ".join([first, *table.notes])
+    first = ", ".join([f"{name}, {counted(len(times), 'rows')}{rate}", time_words, *table.notes])
     del table, positions  # of a long drive, they take as much memory as all that is derived from them
     last = ""
     if drive.times_ns is not None:
@@ -116,6 +91,19 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     readings = [replace(each, note=f"poses: {first}, {each.words()}{last}") for each in readings]
     read = of_reading(readings[0], times, drive.rig)
     return replace(read, geo_origin=origin, readings=tuple(readings), others=others, file=path)
+
+
+def _kind(table: Table) -> str:
+    """The kind of a file of poses; "" for one that is not known."""
+    order = table.columns.get("qw")
+    kinds = {
+        "KITTI": table.has(*MATRIX),
+        "EuRoC": order is not None and (order.startswith("q_rs_") or (table.separator == "," and not order)),
+        "TUM": table.separator in (None, "\t") and tuple(table.columns) == TUM,
+        "GPS": table.has("latitude", "longitude"),
+        "CSV": table.has("x", "y"),
+    }
+    return next((name for name, is_it in kinds.items() if is_it), "")
 
 
 def of_reading(reading: PoseReading, times_ns: NDArray[np.int64], rig: CameraRig) -> ReadPoses:
@@ -155,41 +143,30 @@ def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
 
 def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[np.int64], str]:
     """(T,) times in ns, and what was understood. KITTI's are in times.txt beside, or those of the frames."""
-    row, name = table.row, table.columns.get("time", "")
     if table.has(*MATRIX):
         path, count = table.path, len(table)
         beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
         file = next((each for each in beside if is_there(each)), None)
-        if file is None and (drive.times_ns is None or count != len(drive.times_ns)):
+        if file is None and drive.times_ns is not None and count == len(drive.times_ns):
+            return drive.times_ns, "the times of the frames"
+        if file is None:
             frames = "" if drive.times_ns is None else f", and the drive has {len(drive.times_ns)} frames"
             message = f"{path}: has {count} poses without times{frames}: put times.txt beside it, with {count} lines"
             raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
-        if file is None:
-            assert drive.times_ns is not None
-            return drive.times_ns, "the times of the frames"
-        lines = [line for line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1) if line[1].strip()]
-        if len(lines) != count:
-            raise InputError(f"{file}: has {len(lines)} times (expected {count}, one for each line of {path.name})")
-        texts: Iterable[str] = [text.strip() for _, text in lines]
-
-        def row(index: int) -> CsvRow:
-            return CsvRow(file, lines[index][0], {"time": lines[index][1].strip()})
-
+        table = read_column(file, "time")
+        if len(table) != count:
+            raise InputError(f"{file}: has {len(table)} times (expected {count}, one for each line of {path.name})")
     elif table.has("nanoseconds") and (seconds := next((each for each in ("seconds", "time") if table.has(each)), "")):
         return _both(table, seconds), "seconds and nanoseconds"
     elif not table.has("time"):
         examples = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
         raise InputError(f"{table.path}: a column of times is missing (expected a name such as {examples})")
-    else:
-        texts = table.texts("time")
-    whole, rest = _exact(texts, row)
-    unit_in_name = _UNIT_OF_NAME.search(name)
+    whole, rest = _exact(table)
+    unit_in_name = _UNIT_OF_NAME.search(table.columns["time"])
     of_name = cast("TimeKind | None", unit_in_name and (unit_in_name[1] or unit_in_name[2]))
-    unit = drive.stated.pose_times or of_name or _unit(row(0), whole, rest, positions, drive)
+    unit = drive.stated.pose_times or of_name or _unit(table.row(0), whole, rest, positions, drive)
     if int(np.abs(whole).max()) * UNITS_NS[unit] > LARGEST_INTEGER:
-        raise InputError(
-            f"{row(0).path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)"
-        )
+        raise InputError(f"{table.path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)")
     times = _nanoseconds(whole, rest, unit)
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
 
@@ -208,17 +185,17 @@ def _both(table: Table, seconds: str) -> NDArray[np.int64]:
     return np.array(times)
 
 
-def _exact(texts: Iterable[str], row: Callable[[int], CsvRow]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(T,) times without a unit, in all of their digits: whole numbers, and the rest in 1e-18. row: by its index."""
+def _exact(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(T,) times without a unit, in all of their digits: whole numbers, and the rest in 1e-18."""
     whole, rest = array("q"), array("q")
-    for index, text in enumerate(texts):
+    for index, text in enumerate(table.texts("time")):
         if (plain := _DIGITS.fullmatch(text)) is not None:
             whole.append(int(plain[1]))
             rest.append(int((plain[2] or "").ljust(18, "0")))
             continue
-        value = _decimal(row(index))
+        value = _decimal(table.row(index))
         if abs(value) > LARGEST_INTEGER:
-            raise row(index).error("time", f'"{text:.24}" is too large for a time in any unit')
+            raise table.row(index).error("time", f'"{text:.24}" is too large for a time in any unit')
         whole.append(math.floor(value))
         rest.append(int((value - whole[-1]).scaleb(18)))
     return np.array(whole), np.array(rest)
@@ -290,9 +267,7 @@ def _check_camera(drive: DrivePoses) -> None:
         )
 
 
-def _readings(
-    table: Table, positions: Array, kind: Kind, drive: DrivePoses, times_ns: NDArray[np.int64]
-) -> Iterator[PoseReading]:
+def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArray[np.int64]) -> Iterator[PoseReading]:
     """What the poses may be, the usual first: those of KITTI are of its camera 0."""
     rotations, cameras = _rotations(table, drive), list(drive.rig.names)
     stated = {name: getattr(drive.stated, name) for name in POSE_STATEMENTS[:3]}
@@ -308,7 +283,7 @@ def _readings(
     )
     zeroth = next((name for name in cameras if re.search("(?<![0-9])0+$", name)), "")
     zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
-    yield from sorted(readings, key=lambda each: kind.of_camera and each.camera != zeroth)
+    yield from sorted(readings, key=lambda each: table.has(*MATRIX) and each.camera != zeroth)
 
 
 def _rotations(table: Table, drive: DrivePoses) -> dict[str, Array]:
@@ -326,10 +301,7 @@ def _rotations(table: Table, drive: DrivePoses) -> dict[str, Array]:
         return {"": quaternion_from_rotation(matrices)}
     if table.has(*QUATERNION):
         return _of_quaternions(table, drive)
-    if table.has("yaw") or table.has("heading"):
-        return _of_angles(table, drive)
-    names = "qw, qx, qy, qz; yaw; or heading"
-    raise InputError(f"{table.path}: columns of the orientation are missing (expected {names})")
+    return _of_angles(table, drive)
 
 
 def _of_quaternions(table: Table, drive: DrivePoses) -> dict[str, Array]:

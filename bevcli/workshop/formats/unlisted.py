@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -25,18 +24,13 @@ from bevcli.parsing.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_there, read_
 from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.sequences.native import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
-from bevcli.sequences.videos import count_and_rate
 from bevcli.workshop.formats.camera_names import folder_of_images, match_names, renamed
-from bevcli.workshop.formats.listed_times import listed_times
-from bevcli.workshop.formats.matching import CameraImages, Matched, match, measured_periods
-from bevcli.workshop.formats.name_times import NUMBER, Reading, read_names
-from bevcli.workshop.formats.video_times import container_times_ns
+from bevcli.workshop.formats.matching import CameraImages, Found, Matched, match, measured_periods
+from bevcli.workshop.formats.name_times import NUMBER, Reading, listed_times, read_names
+from bevcli.workshop.formats.video_file import UNEVEN_TEXT, video_images
 
 FILE_NAME = "timing.toml"
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
-UNEVEN = 0.1  # of the period of a video: images farther from even times are at those of the container
-UNEVEN_TEXT = "at uneven times, those of the container"
-Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understood
 
 
 @dataclass(frozen=True)
@@ -142,15 +136,6 @@ def find_frames(
             "images/CAMERA/TIMESTAMP.jpg, or videos/CAMERA.mp4"
         )
     return entries, f"frames.csv is missing: found {counted(len(entries), 'frames')}: {line}"
-
-
-def covered(found: Found, motion: EgoMotion) -> Found:
-    """The frames that the poses cover, if these are at least half of them; otherwise all, which is an error later."""
-    entries, line = found
-    kept = [entry for entry in entries if motion.covered(entry.times_ns).all()]
-    if len(kept) == len(entries) or 2 * len(kept) < len(entries):
-        return found
-    return tuple(kept), f"{line}; {counted(len(entries) - len(kept), 'frames')} outside of the poses left out"
 
 
 def _folders(folder: Path) -> list[str]:
@@ -328,24 +313,3 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
     is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
     stated = "times as stated" if is_stated else "times from 0 on (state `start_ns` (`--start-ns`))"
     return matched.entries, f"{stated}, {_matched(videos, matched)}{renamed(names)}"
-
-
-def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) -> CameraImages:
-    """The images of a video. start_ns: time of the first. rate_hz: default the one stated in the video.
-
-    Where the images are not evenly spaced, their times are those of the container. Raises InputError.
-    """
-    count, own_rate_hz = count_and_rate(path)
-    times = np.round(np.arange(count) * 1e9 / (rate_hz or own_rate_hz)).astype(np.int64)
-    stated = container_times_ns(path) if rate_hz is None else None
-    period = 1e9 / (rate_hz or own_rate_hz)
-    is_uneven = stated is not None and len(stated) > 1 and _is_uneven(stated, period)
-    if stated is not None and is_uneven:
-        times, period = stated, float(np.median(np.diff(stated)))
-    times = start_ns + times
-    return CameraImages(path.name, times, period, lambda index: ImageSource(path, int(times[index]), index), is_uneven)
-
-
-def _is_uneven(times_ns: NDArray[np.int64], period_ns: float) -> bool:
-    """True where an image is farther than `UNEVEN` of a period from where even ones would be."""
-    return bool(np.abs(times_ns - np.arange(len(times_ns)) * period_ns).max() > UNEVEN * period_ns)
