@@ -92,31 +92,25 @@ def read_rig(
     posed = {name: of for name, of in cameras.items() if name in used or of.pose is not None}
     readings, how = _readings(where, posed, stated, height, yaw_deg)
     ego_from_camera = readings[0].ego_from_camera
-    rig = tuple(
-        require(
-            parse_camera, name, _fields(name, of, ego_from_camera[name], calibration, drive), where=where, camera=name
-        )
-        for name, of in cameras.items()
-        if name in used
-    )
-    text = "; ".join(
-        filter(
-            None,
-            (
-                f"{calibration.name}: {format_name}: {counted(len(rig), 'cameras')}",
-                how or poses_in_words(readings[0]),
-                left_out,
-            ),
-        )
-    )
-    ego_from_bev = _bev_frame(where)
-    camera_rig = CameraRig(rig, default_ego_from_bev() if ego_from_bev is None else ego_from_bev, ego_from_bev is None)
-    findings = [Finding("calibration-read", "info", None, text)]
+    fields = {name: _fields(name, of, ego_from_camera[name], calibration, drive)
+              for name, of in cameras.items() if name in used}  # fmt: skip
+    how = f"{counted(len(fields), 'cameras')}; {how or poses_in_words(readings[0])}"
+    rig, findings = _rig(fields, where, _bev_frame(where), f"{calibration.name}: {format_name}: {how}", left_out)
     if is_open := [name for name in used if cameras[name].lens_is_open]:
         findings.append(Finding("lens-assumed", "info", None, OPEN_LENS.format(calibration.name, ", ".join(is_open))))
     readings = readings if readings[0].states else ()
     others = _readings(where, posed, {}, height, yaw_deg)[0] if stated else ()
-    return RigDraft(camera_rig, tuple(findings), readings=readings, others=others, file=where)
+    return RigDraft(rig, tuple(findings), readings=readings, others=others, file=where)
+
+
+def _rig(
+    fields: Mapping[str, Fields], where: Path | None, ego_from_bev: Array | None, *words: str
+) -> tuple[CameraRig, list[Finding]]:
+    """The rig of cameras as in calibration.json, and how it was understood."""
+    cameras = tuple(require(parse_camera, name, of, where=str(where), camera=name) for name, of in fields.items())
+    bev = default_ego_from_bev() if ego_from_bev is None else ego_from_bev
+    finding = Finding("calibration-read", "info", None, "; ".join(filter(None, words)))
+    return CameraRig(cameras, bev, ego_from_bev is None), [finding]
 
 
 def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
@@ -260,25 +254,22 @@ def _guessed_rig(drive: Path | None, fov_deg: ByCamera, height: ByCamera, yaw_de
         )
     fovs = _by_camera(fov_deg, tuple(names), "fov_deg")
     poses, how = _guessed_poses(tuple(names), height, yaw_deg)
-    cameras = []
+    cameras = {}
     for name in names:
         size = size_of_first(drive, name)
         if size is None:
             raise InputError(f"{drive}: camera {name}: its first image cannot be read: bring it back")
         if not FOV_DEG[0] <= fovs[name] <= FOV_DEG[1]:
-            raise InputError(
-                f"`fov_deg={fovs[name]:g}` (`--fov`): expected the horizontal field of view, 5 to 170 degrees"
-            )
+            expected = "the horizontal field of view, 5 to 170 degrees"
+            raise InputError(f"`fov_deg={fovs[name]:g}` (`--fov`): expected {expected}")
         width, tall = size
         focal = width / 2 / np.tan(np.radians(fovs[name]) / 2)
         matrix = [[focal, 0, (width - 1) / 2], [0, focal, (tall - 1) / 2], [0, 0, 1]]
-        fields: Fields = {"width": width, "height": tall, "intrinsics": matrix}
-        fields["ego_from_camera"] = transform_to_json(poses[name])
-        cameras.append(require(parse_camera, name, fields, where=str(drive), camera=name))
+        pose = transform_to_json(poses[name])
+        cameras[name] = {"width": width, "height": tall, "intrinsics": matrix, "ego_from_camera": pose}
     text = f"without calibration: {counted(len(cameras), 'cameras')} without lens distortion, {how}"
-    return RigDraft(
-        CameraRig(tuple(cameras), default_ego_from_bev(), True), (Finding("calibration-read", "info", None, text),)
-    )
+    rig, findings = _rig(cameras, drive, None, text)
+    return RigDraft(rig, tuple(findings))
 
 
 def _guessed_poses(names: tuple[str, ...], height: ByCamera, yaw_deg: ByCamera) -> tuple[dict[str, Array], str]:

@@ -65,48 +65,33 @@ def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = Fol
     """
     path = folder / FILE_NAME
     stated = parse_toml(read_text(path, TOML_BYTES), path) if is_there(path) else {}
-    _check_keys(path, "", stated, ("start_ns", "rate_hz", "times", "cameras"))
-    of_cameras = stated.get("cameras", {})
-    if not isinstance(of_cameras, dict):
-        raise InputError(f'{path}: "cameras": expected a table for each camera, such as [cameras.{cameras[0]}]')
-    _check_keys(path, "cameras.", of_cameras, cameras)
-    kinds, times = get_args(TimeKind), stated.get("times")
-    if times is not None and times not in kinds:
-        raise InputError(f"{path}: times: expected one of {', '.join(kinds)}, found {times!r}")
-    rate_hz = own.image_rate_hz or _rate(path, "", stated)
-    start_ns = _integer(path, "", stated, "start_ns") if own.start_ns is None else own.start_ns
-    made = {name: _camera(path, f"cameras.{name}", of_cameras.get(name, {}), rate_hz) for name in cameras}
-    return Timing(start_ns, rate_hz, own.times or times, made)
+    kinds = get_args(TimeKind)
+    _check_table(path, "", stated, ("start_ns", "rate_hz", "times", "cameras"))
+    if stated.get("times", "s") not in kinds:
+        raise InputError(f"{path}: times: expected one of {', '.join(kinds)}, found {stated['times']!r}")
+    _check_table(path, "cameras", stated.get("cameras", {}), cameras)
+    rate_hz, made = own.image_rate_hz or stated.get("rate_hz"), {}
+    for name in cameras:
+        table = stated.get("cameras", {}).get(name, {})
+        _check_table(path, f"cameras.{name}", table, ("offset_ns", "rate_hz"))
+        made[name] = CameraTiming(table.get("offset_ns", 0), table.get("rate_hz", rate_hz))
+    start_ns = stated.get("start_ns") if own.start_ns is None else own.start_ns
+    return Timing(start_ns, rate_hz, own.times or stated.get("times"), made)
 
 
-def _camera(path: Path, where: str, table: Any, rate_hz: float | None) -> CameraTiming:
+def _check_table(path: Path, name: str, table: Any, known: tuple[str, ...]) -> None:
+    """Raise InputError for a table with a key that is not known, or a time or a rate that is none."""
     if not isinstance(table, dict):
-        raise InputError(f"{path}: {where}: expected a table, such as [{where}]")
-    _check_keys(path, f"{where}.", table, ("offset_ns", "rate_hz"))
-    offset_ns = _integer(path, f"{where}.", table, "offset_ns")
-    return CameraTiming(offset_ns or 0, _rate(path, f"{where}.", table) or rate_hz)
-
-
-def _check_keys(path: Path, where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
-    for key in table:
+        raise InputError(f"{path}: {name}: expected a table, such as [{name}]")
+    for key, value in table.items():
+        where = ".".join(filter(None, (name, key)))
         if key not in known:
-            raise InputError(f'{path}: unknown key "{where}{key}" (known: {", ".join(known)})')
-
-
-def _integer(path: Path, where: str, table: Mapping[str, Any], key: str) -> int | None:
-    value = table.get(key)
-    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or abs(value) > LARGEST_NS):
-        raise InputError(f"{path}: {where}{key}: expected an integer (nanoseconds), found {value!r}")
-    return value
-
-
-def _rate(path: Path, where: str, table: Mapping[str, Any]) -> float | None:
-    value = table.get("rate_hz")
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not RATES_HZ[0] <= value <= RATES_HZ[1]:
-        raise InputError(f"{path}: {where}rate_hz: expected images per second, above 0, found {value!r}")
-    return float(value)
+            raise InputError(f'{path}: unknown key "{where}" (known: {", ".join(known)})')
+        if key in ("start_ns", "offset_ns") and (type(value) is not int or abs(value) > LARGEST_NS):
+            raise InputError(f"{path}: {where}: expected an integer (nanoseconds), found {value!r}")
+        is_rate = type(value) in (int, float) and RATES_HZ[0] <= value <= RATES_HZ[1]
+        if key == "rate_hz" and not is_rate:
+            raise InputError(f"{path}: {where}: expected images per second, above 0, found {value!r}")
 
 
 def find_frames(
