@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from bevcli.errors import BevcliError, InputError
+from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.printing import valid_text
 
 MIB = 1 << 20
@@ -87,8 +87,8 @@ def open_regular(
 
 
 def hash_of_file(path: Path) -> str:
-    """SHA-256 of the contents of a file, hexadecimal. Raises OSError."""
-    with path.open("rb") as file:
+    """SHA-256 of the contents of a file of weights, hexadecimal. Raises WeightsError where it is no regular file."""
+    with open_regular(path, error=WeightsError) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -19,7 +19,7 @@ from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.files.boxes_table import ImageBoxesWriter
+from bevcli.sequences.files.boxes_table import IMAGE_COLUMNS, ImageBoxesWriter
 from bevcli.workshop.trust import estimate
 from bevcli.workshop.trust.agreement import Agreement, agreement, compared, kept
 from bevcli.workshop.trust.sightings import projected, unexplained
@@ -195,9 +195,14 @@ def test_what_a_run_saw_is_read_back(tmp_path: Path):
     (stamp,), (cameras,) = zip(*seen_in_run(tmp_path / "image_boxes.csv").items(), strict=True)
     assert stamp == (3, 7)
     assert cameras["front"].corners.tolist() == BICYCLE.corners.tolist()
-    (tmp_path / "image_boxes.csv").write_text("frame\n1,2\n")
+
+
+@pytest.mark.parametrize("row", ["1,2", "3,a,7,front,car,0.5,1,2,3,nan", f"3,a,7,{'x' * 200_000},car,0.5,1,2,3,4", ""])
+def test_what_no_run_saw_is_one_line(tmp_path: Path, row: str):
+    path = tmp_path / "image_boxes.csv"
+    path.write_text(f"{','.join(IMAGE_COLUMNS)}\n{row}\n" if row else row)
     with pytest.raises(InputError, match=r"image_boxes\.csv: cannot be read"):
-        seen_in_run(tmp_path / "image_boxes.csv")
+        seen_in_run(path)
 
 
 @pytest.fixture

@@ -84,7 +84,9 @@ def array_of_numbers(value: object) -> Array | None:
         array = np.array(value)
     except (ValueError, OverflowError):  # rows of different lengths
         return None
-    return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else None
+    if array.dtype.kind not in "iuf" or any(isinstance(each, bool) for each in np.array(value, object).flat):
+        return None
+    return array.astype(np.float64, copy=False)
 
 
 def parse_transform(owner: Mapping[str, Any], name: str, report: Report) -> Array | None:

@@ -83,7 +83,8 @@ class StatedPose:
             in_metres(each, states) for each in (self.matrices.get(states["rig_angles"], self.any_matrix), self.then)
         )
         if self.exact:
-            return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
+            with np.errstate(invalid="ignore"):  # infinity is refused where the camera is made
+                return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
         body_from_axes = matrix if states["transform"] == "ego_from_camera" else inverse(matrix)
         ego_from_body = rigid(rotation=EGO_FROM_BODY[states["rig_axes"]])
         return ego_from_body @ body_from_axes @ inverse(rigid(rotation=AXES[states["camera_axes"]])) @ then

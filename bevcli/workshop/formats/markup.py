@@ -19,9 +19,11 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _YamlLoader(_SafeLoader):
-    """The safe loader, which makes no Python objects, reads OpenCV's matrices as mappings and 1e-05 as a number.
+    """The safe loader, which makes no Python objects, and reads OpenCV's matrices as mappings.
 
-    A key twice in a mapping is an error, and so are more values than a file may have, merges written out.
+    Numbers are those of JSON and YAML 1.2: 1e-05 is one, and 010, 12:30 and 1_0, which YAML 1.1 reads as 8, 750 and 10,
+    are texts, as "no" and dates are. A key twice in a mapping is an error, and so are more values than a file may have,
+    merges written out.
     """
 
     def __init__(self, text: str) -> None:
@@ -34,7 +36,9 @@ class _YamlLoader(_SafeLoader):
         if id(node) not in self._seen:
             self._seen.add(id(node))
             keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != MERGE_TAG]
-            twice = first_twice([self.construct_object(key) for key in keys])
+            values = [self.construct_object(key) for key in keys]
+            twice = first_twice(values)
+            twice = first_twice([*map(str, values)]) if twice is None else twice  # 1 and "1" name one camera
             if twice is not None:
                 where, name = f"line {keys[twice].start_mark.line + 1}", keys[twice].value
                 raise InputError(f'{where}: "{name:.60}" appears twice in the same mapping: remove or rename one')
@@ -47,11 +51,19 @@ class _YamlLoader(_SafeLoader):
 _YamlLoader.add_constructor(
     "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
 )
-_YamlLoader.add_implicit_resolver(  # YAML 1.1 has no numbers with an exponent and without a point, YAML 1.2 has
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)[eE][-+]?[0-9]+\Z"),
-    list("-+.0123456789"),
-)
+SCALARS = {  # tag -> its texts, and how they begin
+    "int": (r"[-+]?(?:0|[1-9][0-9]*|0x[0-9a-fA-F]+)\Z", "-+0123456789"),
+    "float": (
+        r"[-+]?(?:\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))(?:[eE][-+]?[0-9]+)?\Z|[-+]?\.(?:inf|nan)\Z",
+        "-+.0123456789",
+    ),
+    "bool": (r"(?:true|True|TRUE|false|False|FALSE)\Z", "tTfF"),
+    "null": (r"(?:~|null|Null|NULL|)\Z", ("~", "n", "N", "")),
+    "merge": (r"<<\Z", "<"),
+}
+_YamlLoader.yaml_implicit_resolvers = {}
+for tag, (pattern, firsts) in SCALARS.items():
+    _YamlLoader.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(pattern), list(firsts))
 
 
 def read_yaml(path: Path) -> Any:

@@ -20,6 +20,9 @@ from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.inference.image_boxes import camera_boxes
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
+from bevcli.parsing.documents import CSV_BYTES
+from bevcli.parsing.files import read_text
+from bevcli.sequences.files.boxes_table import IMAGE_COLUMNS
 
 SOURCE, PART = "photographs", "image_detector."  # the model of the package whose weights have the detector's, and where
 
@@ -46,16 +49,21 @@ def seen_in_run(path: Path) -> dict[tuple[int, int], dict[str, Boxes2D]]:
     """The image_boxes.csv of a run: index and time of a frame -> cell of a camera -> boxes. Raises InputError."""
     rows: dict[tuple[int, int], dict[str, list[list[str]]]] = {}
     try:
-        for index, _, time, camera, *cells in list(csv.reader(path.read_text(encoding="utf-8").splitlines()))[1:]:
+        table = csv.reader(read_text(path, CSV_BYTES).splitlines())
+        if next(table, None) != list(IMAGE_COLUMNS):
+            raise ValueError(f"expected the columns {', '.join(IMAGE_COLUMNS)}")
+        for index, _, time, camera, *cells in table:
             rows.setdefault((int(index), int(time)), {}).setdefault(camera, []).append(cells)
         return {stamp: {name: _boxes(of) for name, of in cameras.items()} for stamp, cameras in rows.items()}
-    except (OSError, ValueError) as error:
+    except (ValueError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as boxes in images ({error}): run again with --force") from None
 
 
 def _boxes(rows: list[list[str]]) -> Boxes2D:
     """Boxes of rows of class, score and edges."""
     numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(len(rows), 5)
+    if not np.isfinite(numbers).all():
+        raise ValueError("a number is not finite")
     return Boxes2D(numbers[:, 1:], np.array([row[0] for row in rows]), numbers[:, 0])
 
 
