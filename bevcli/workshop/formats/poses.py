@@ -175,7 +175,11 @@ def _both(table: Table, seconds: str) -> NDArray[np.int64]:
     """Seconds of a column and nanoseconds of another one."""
     times = array("q")
     for row in table.rows():
-        time = row.integer(seconds) * 10**9 + row.integer("nanoseconds")
+        part = row.integer("nanoseconds")
+        time = row.integer(seconds) * 10**9 + part
+        if not 0 <= part < 10**9:
+            advice = f"remove the column {table.columns[seconds]}, if this has all of the time"
+            raise row.error(table.columns["nanoseconds"], f"{part} is no part of a second: {advice}")
         if abs(time) > LARGEST_INTEGER:
             advice = (
                 f"is its unit seconds? Remove the column {table.columns['nanoseconds']}, if that has all of the time"
