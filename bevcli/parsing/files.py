@@ -12,8 +12,8 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.printing import valid_text
@@ -70,7 +70,7 @@ def read_text(path: Path, largest: int, *, error: type[BevcliError] = InputError
 
 def open_regular(
     path: Path, *, missing: str = "the file is missing", error: type[BevcliError] = InputError
-) -> BinaryIO:
+) -> BufferedReader:
     """Opens a regular file for reading. Raises `error` for anything else; opening a pipe does not wait for a writer."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
