@@ -10,8 +10,9 @@ import re
 import shutil
 import ssl
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from http.client import HTTPException, HTTPResponse, InvalidURL
 from itertools import count
 from pathlib import Path
@@ -182,6 +183,18 @@ class _Redirects(HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
+def steady(parts: Iterable[bytes]) -> Iterator[bytes]:
+    """The parts of an answer as they come. Raises TimeoutError where they come too slowly."""
+    began, came = time.monotonic(), 0
+    for part in parts:
+        yield part
+        came += len(part)
+        if (now := time.monotonic()) > began + STALL_S:
+            if came < STALL_BYTES * STALL_S:
+                raise TimeoutError(f"slower than {STALL_BYTES} bytes a second")
+            began, came = now, 0
+
+
 class Download:
     """A download of several attempts.
 
@@ -233,17 +246,11 @@ class Download:
             with self._open(part) as answer:
                 self._accept(answer, part)
                 yield self.done, self.total
-                began, before = time.monotonic(), self.done
-                while data := answer.read1(BLOCK):
+                for data in steady(iter(partial(answer.read1, BLOCK), b"")):
                     self._write(data)
                     yield self.done, self.total
-                    now = time.monotonic()
-                    if now > end:
+                    if time.monotonic() > end:
                         raise _Failed("timed out")
-                    if now > began + STALL_S:
-                        if self.done - before < STALL_BYTES * STALL_S:
-                            raise _Failed(f"slower than {STALL_BYTES} bytes a second")
-                        began, before = now, self.done
         except (OSError, HTTPException, ValueError) as error:  # a chunk of a damaged length is a ValueError
             raise _Failed(str(error) or type(error).__name__) from None
         finally:

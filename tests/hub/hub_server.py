@@ -2,6 +2,7 @@
 
 import hashlib
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -10,13 +11,15 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 class Hub(BaseHTTPRequestHandler):
     """`commits`: commit -> file -> content, of the repository team/model, whose branch main is the last commit.
 
-    `lies`: headers that take the place of the true ones.
+    `lies`: headers that take the place of the true ones. `pause_s`: before each byte of a body.
     """
 
     protocol_version = "HTTP/1.1"
     commits: dict[str, dict[str, bytes]]
     asked: list[str]
     lies: dict[str, str]
+    pause_s = 0.0
+    status = 200
 
     def do_HEAD(self) -> None:
         self.answer(with_body=False)
@@ -53,12 +56,16 @@ class Hub(BaseHTTPRequestHandler):
             self.send(self.commits[revision][parts[4]], with_body=with_body, **{"X-Repo-Commit": revision})
 
     def send(self, content: bytes, status: int = 200, *, with_body: bool, **headers: str) -> None:
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(content)))
-        for name, value in ({"ETag": f'"{digest(content)}"'} | headers | self.lies).items():
+        self.send_response(self.status if status == 200 else status)
+        true = {"Content-Length": str(len(content)), "ETag": f'"{digest(content)}"'}
+        for name, value in (true | headers | self.lies).items():
             self.send_header(name, value)
         self.end_headers()
-        if with_body:
+        if with_body and self.pause_s:
+            for byte in content:
+                self.wfile.write(bytes([byte]))
+                time.sleep(self.pause_s)
+        elif with_body:
             self.wfile.write(content)
 
     def refuse(self, code: str, status: int = 404, **headers: str) -> None:

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from bevcli.config import as_table, config_of_table, known_models, load_config
 from bevcli.errors import BevcliError, InputError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
+from bevcli.weights import fetch
 from bevcli.workshop.hub.download import import_hub
 from bevcli.workshop.hub.pack import pack_model
 
@@ -171,6 +173,24 @@ def test_a_server_names_no_file_outside_the_cache(hub, tmp_path, header, name):
     with pytest.raises(WeightsError):
         load_model("hf:team/model")
     assert not list(tmp_path.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("lies", "said"),
+    [
+        ({"Retry-After": "100000"}, "too many requests: try again in 100000 s"),
+        ({"Content-Length": "1" + "0" * 15}, r"the server sends more than 4,294,967,296 bytes: refused"),
+        ({}, "slower than 4096 bytes a second"),
+    ],
+)
+def test_a_server_lets_nobody_wait(hub, monkeypatch, lies, said):
+    hub.lies.update(lies)
+    hub.status = 429 if "Retry-After" in lies else 200
+    hub.pause_s = 0.0 if lies else 0.1
+    monkeypatch.setattr(fetch, "STALL_S", 0.2)
+    warnings.simplefilter("error")  # of huggingface_hub, beside the error
+    with pytest.raises(WeightsError, match=f"hf:team/model: cannot be downloaded .*{said}"):
+        load_model("hf:team/model")
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import MIB, hash_of_file, is_file_name, read_bytes
 from bevcli.printing import one_line, reason_of
 from bevcli.published import HubModel, Known
+from bevcli.weights.fetch import LENGTH_DIGITS, MOST_BYTES, steady
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 FORMAT = 1  # of config.json; increase it when an earlier bevcli cannot read it
@@ -120,21 +121,33 @@ def _check_answers(hub: Any) -> None:
 
     def checking_client() -> Any:
         client = make_client()
-        client.event_hooks["response"].append(_check_names)
+        client.event_hooks["response"].append(_check)
         return client
 
     checking_client.checks_names = True  # type: ignore[attr-defined]
     hub.set_client_factory(checking_client)
 
 
-def _check_names(answer: Any) -> None:
-    """Raise WeightsError where a name in the headers of a server's answer would lead out of its folder."""
+def _check(answer: Any) -> None:
+    """Raise WeightsError where a server sends too much or lets wait, or a name in its headers leads out of its folder.
+
+    What it sends too slowly ends in a TimeoutError.
+    """
+    host, headers = answer.request.url.host, answer.headers
+    if answer.status_code == 429:  # huggingface_hub would wait as long as it is told
+        wait = headers.get("Retry-After", "")
+        raise WeightsError(
+            f"{host}: too many requests: try again {f'in {wait:.20} s' if wait.isdecimal() else 'later'}"
+        )
+    sizes = (headers.get(name, "") for name in ("Content-Length", "X-Linked-Size"))
+    if any(size.isdecimal() and int(size[:LENGTH_DIGITS]) > MOST_BYTES for size in sizes):
+        raise WeightsError(f"{host}: the server sends more than {MOST_BYTES:,} bytes: refused")
+    parts = answer.iter_raw
+    answer.iter_raw = lambda chunk_size=None: steady(parts(chunk_size))
     for header in NAMES if answer.request.method == "HEAD" else ():  # in other answers they name nothing
-        name = answer.headers.get(header, "").removeprefix("W/").strip('"')
+        name = headers.get(header, "").removeprefix("W/").strip('"')
         if name and not is_file_name(name):
-            raise WeightsError(
-                f"{answer.request.url.host}: the server's {header} is no name of a file ({one_line(name, 60)}): refused"
-            )
+            raise WeightsError(f"{host}: the server's {header} is no name of a file ({one_line(name, 60)}): refused")
 
 
 class PackedConfig(msgspec.Struct, frozen=True, kw_only=True):
@@ -168,7 +181,7 @@ def read_folder(folder: Path, source: str, mend: str = "pack the model anew") ->
         config = msgspec.convert(parse_json(content, path), PackedConfig)
     except (msgspec.MsgspecError, InputError) as error:
         reason = str(error).removeprefix(f"{path}: ")
-        raise WeightsError(f"{path}: is not of `bevcli weights pack` ({reason})") from None
+        raise WeightsError(f"{path}: is not of `bevcli weights pack` ({reason}): {mend}") from None
     if config.library_name != "bevcli" or config.format != FORMAT:
         identity = f"library {config.library_name:.60}, format {config.format}"
         raise WeightsError(
