@@ -43,13 +43,6 @@ def run(
             "Input",
         ),
     ] = False,
-    score_without_labels: Annotated[
-        bool,
-        Option(
-            "Print how well the boxes agree with a detector in the images; the drive needs no ground truth.",
-            "Output",
-        ),
-    ] = False,
     output: OutputOptions,
     format_options: FormatValues,
 ) -> None:
@@ -105,7 +98,7 @@ def run(
                     break
     summary = running.summary
     say(summary.table())
-    if score_without_labels:
+    if run_options.score_without_labels:
         from bevcli.workshop.trust import estimate
 
         found = estimate.agreement_of_run(out, drive)

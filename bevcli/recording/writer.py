@@ -268,7 +268,8 @@ class Recording:
         if prediction is not None:
             if self._recorded.results:
                 self._log_results(prediction, frame_poses, cameras)
-            if self._recorded.config is not None and self._recorded.config.image_classes:
+            has_detector = self._recorded.config is not None and bool(self._recorded.config.image_classes)
+            if has_detector or prediction.image_boxes is not None:
                 found_in = prediction.image_boxes or {}
                 shown = {name: boxes.scored(self._options.score) for name, boxes in found_in.items()}
                 least, classes = self._options.score, self._recorded.classes

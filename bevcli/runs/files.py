@@ -69,7 +69,7 @@ class RunFiles:
         self._files: dict[str, GrowingFile] = {}  # those that are open, beside the recording
         self._submission: SubmissionWriter | None = None  # of nuScenes drives
         self._tracks: CsvWriter | None = None
-        self._image_boxes: ImageBoxesWriter | None = None  # of models with a detector
+        self._image_boxes: ImageBoxesWriter | None = None  # of models with a detector, or of the witness
         self._reference = "world" if drive.has_ego_motion else "ego"
         self._results: dict[type[FrameResult], Any] = {}  # type of results -> what its `writer` made
         self._map_frames = list(state.files.map_frames) if state.files else []
@@ -99,7 +99,7 @@ class RunFiles:
             self._boxes = self._open(PREDICTIONS, BoxesWriter, frame_of_reference=self._reference, extras=extras)
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
-            if config.image_classes:
+            if config.image_classes or self._options.score_without_labels:
                 self._image_boxes = self._open(IMAGE_BOXES, ImageBoxesWriter)
             for result, names in config.results.items():
                 about = {"frame_of_reference": self._reference, "extras": {**extras, "classes": list(names)}}

@@ -19,6 +19,12 @@ class RunOptions(StepOptions):
         panel="Output",
         metavar="DIR",
     )
+    score_without_labels: bool = option(
+        default=False,
+        help="Print how well the boxes agree with a detector in the images, and draw what it sees; the drive needs no "
+        "ground truth.",
+        panel="Output",
+    )
 
 
 @options("Output")

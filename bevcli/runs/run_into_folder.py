@@ -109,6 +109,10 @@ def run_in_folder(
         try:
             with files:
                 steps = runner.run(drive, range(done, len(drive.stamps)), state.runner)
+                if options.score_without_labels:
+                    from bevcli.workshop.trust.estimate import witnessed
+
+                    steps = witnessed(steps, drive)
                 with contextlib.closing(write_behind(steps, files.write)) as frames:
                     yield FolderRun(frames, done if state.files else 0, summary)
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:

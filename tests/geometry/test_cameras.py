@@ -99,6 +99,11 @@ def test_image_of_a_camera_without_distortion_stays_as_it_is():
 
 
 @pytest.mark.parametrize("lens", LENSES)
+def test_no_points_have_no_rays(lens):
+    assert camera(lens).rays(np.zeros((0, 2))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("lens", LENSES)
 def test_distorted_pixels_are_those_of_the_same_ray(lens):
     pinhole, _ = camera().project(points_in_view())
     expected, _ = camera(lens).project(points_in_view())

@@ -22,7 +22,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.sequences.files.boxes_table import IMAGE_COLUMNS, ImageBoxesWriter
 from bevcli.workshop.trust import estimate
 from bevcli.workshop.trust.agreement import Agreement, agreement, compared, kept
-from bevcli.workshop.trust.sightings import projected, unexplained
+from bevcli.workshop.trust.sightings import projected, sightings, unexplained
 from bevcli.workshop.trust.witness import load_witness, seen_in_run
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
@@ -42,8 +42,8 @@ def boxes(*rows: tuple[str, float, float], score: float = 0.8, speed: float = 0.
     return Boxes3D(centers, sizes, np.zeros(count), velocities, names, scores=np.full(count, score))
 
 
-def frame(index: int = 0) -> Frame:
-    stamp = FrameStamp(index, "", index * 500_000_000)
+def frame(index: int = 0, step_s: float = 0.5) -> Frame:
+    stamp = FrameStamp(index, "", round(index * step_s * 1e9))
     rig = CameraRig((CAMERA,), default_ego_from_bev())
     return SimpleNamespace(stamp=stamp, rig=rig, world_from_ego=STANDS, world_from_ego_at={"front": STANDS})
 
@@ -62,7 +62,7 @@ def held(ours: Boxes3D, witness: dict[str, Boxes2D], frames: int = 1, range_m: f
     return agreement(list(compared(each, NUSCENES_CLASSES, range_m, has_poses=True)), worst=3)
 
 
-CARS = boxes(("car", 10, -3), ("car", 12, 3), ("car", 20, 0), ("pedestrian", 8, 0.5), ("bicycle", 15, 8))
+CARS = boxes(("car", 10, -3), ("car", 12, 3), ("car", 20, 0), ("pedestrian", 8, 0.5), ("bicycle", 15, 8), score=1.0)
 
 
 def test_a_box_is_projected_as_by_hand():
@@ -167,11 +167,33 @@ def test_groups_do_not_explain_each_other():
 
 
 @pytest.mark.parametrize(
-    ("off_m", "speed", "share"), [(0.0, 0.0, 1.0), (2.0, 4.0, 1.0), (0.5, 0.0, np.exp(-0.5)), (5.0, 4.0, 0.0)]
+    ("off_m", "speed", "share"), [(0.0, 0.0, 1.0), (2.0, 4.0, 1.0), (1.0, 0.0, 0.75), (7.0, 4.0, 0.0)]
 )
 def test_a_box_is_kept_where_its_velocity_leads(off_m: float, speed: float, share: float):
     before, after = boxes(("car", 10, 0), speed=speed), boxes(("car", 10 + off_m, 0))
     assert kept(before, after, 0.5) == pytest.approx((0.8 * share, 0.8))
+
+
+@pytest.mark.parametrize("step_s", [0.1, 0.5, 2.0])
+def test_boxes_are_kept_if_they_are_there_half_a_second_later(step_s: float):
+    frames = [frame(index, step_s) for index in range(6)]
+    each = ((one, boxes(("car", 10 + one.stamp.timestamp_ns / 1e9, 0), speed=1.0), None) for one in frames)
+    parts = list(compared(each, NUSCENES_CLASSES, 50.0, has_poses=True))
+    assert [one.stamp for one in parts] == [one.stamp for one in frames]
+    expected = {0.1: 2, 0.5: 5, 2.0: 0}[step_s]  # the last 0.4 s have no later frame
+    assert sum(one.kept == pytest.approx((0.8, 0.8)) for one in parts) == expected
+
+
+def test_two_boxes_are_not_kept_by_one():
+    assert kept(boxes(("car", 10, 0), ("car", 10, 0)), boxes(("car", 10, 0)), 0.5) == pytest.approx((0.8, 1.6))
+
+
+@pytest.mark.parametrize(("off_m", "within"), [(0.4, 4), (0.9, 3), (1.9, 2), (2.5, 1)])
+def test_a_fit_is_half_overlap_and_half_the_place_of_the_feet(off_m: float, within: int):
+    wide = replace(boxes(("car", 10, 0)), sizes_lwh=np.array([[2.0, 8.0, 1.5]]))
+    (ours, _) = sightings(frame(), wide, seen(replace(wide, centers=wide.centers + [0, off_m, 0])), NUSCENES_CLASSES)
+    assert ours.fits[0] == pytest.approx((ours.overlaps[0] + within / 4) / 2)
+    assert ours.overlaps[0] == pytest.approx((8 - off_m) / (8 + off_m))
 
 
 def test_two_seconds_have_no_interval_and_an_empty_road_no_score():
@@ -226,7 +248,24 @@ def test_eval_of_a_drive_without_labels_is_agreement(unlabelled: Path):
     assert 0 <= found["low"] <= found["score"] <= found["high"] <= 1
     assert found["groups"]["vehicles"]["objects"] == 6 * found["looked_at"]
     assert (len(found["worst_frames"]), found["looked_at"]) == (2, 7)
-    assert "agreement 0." in CliRunner().invoke(app, command).stdout
+    files = ("--csv", str(unlabelled / "a.csv"), "--latex", str(unlabelled / "a.tex"))
+    assert "agreement 0." in CliRunner().invoke(app, [*command, *files]).stdout
+    rows = [line.split(",") for line in (unlabelled / "a.csv").read_text().splitlines()]
+    assert ["agreement", "agreement", "score", str(found["score"])] in rows
+    assert ["groups", "vehicles", "of objects", str(found["groups"]["vehicles"]["objects"])] in rows
+    assert "% distances" in (unlabelled / "a.tex").read_text()
+
+
+def test_a_run_without_a_detector_has_the_boxes_of_the_witness(unlabelled: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(estimate, "SHORT", 0)
+    drive, model = (
+        bevcli.open_sequence(unlabelled / "drive", frames=slice(0, 4)),
+        bevcli.load_model("demo", device="cpu"),
+    )
+    bevcli.run_into_folder(model, drive, unlabelled / "out", bevcli.RunOptions(score_without_labels=True))
+    assert [index for index, _ in seen_in_run(unlabelled / "out" / "image_boxes.csv")] == [0, 3]
+    found = estimate.agreement_of_run(unlabelled / "out", drive)
+    assert (found.frames, found.groups["vehicles"].objects) == ((4, 2), 6 * 2)
 
 
 def test_eval_of_a_drive_without_labels_refuses_options_of_labels(unlabelled: Path):

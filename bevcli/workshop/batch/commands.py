@@ -44,7 +44,7 @@ def batch(
     options: BatchOptions,
     workers: Workers,
     model: ModelOptions,
-    run_options: Annotated[RunOptions, Part(without=("save_bev",))],
+    run_options: Annotated[RunOptions, Part(without=("save_bev", "score_without_labels"))],
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
     source: Annotated[InputOptions, Part(without=("scene",))],
     format_options: Annotated[

@@ -3,7 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
@@ -13,6 +13,9 @@ from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.scores import EvaluationOptions, ResultOptions
 from bevcli.workshop.scores.tables import write_csv, write_latex
+
+if TYPE_CHECKING:
+    from bevcli.workshop.trust.agreement import Agreement
 
 PANEL = "Score"
 
@@ -46,28 +49,30 @@ def evaluate(
     """
     if options.csv is not None and options.csv == options.latex:
         raise InputError(f"--latex: {options.latex} is the file of --csv too (expected two files): name another")
+    scores: Any
     if len(predictions) == 1 and _is_unlabelled(ground_truth):
-        further = {**vars(options), **vars(results), "worst": None}
-        if given := [name for name, value in further.items() if value]:
-            raise InputError(f"--{given[0].replace('_', '-')}: {ground_truth} has no ground truth: remove it")
-        _print_agreement(predictions[0], ground_truth, source, results.worst or 0, format_options, as_json=as_json)
-        return
-    if len(predictions) > 2:
+        given = {**vars(options), **vars(results)}
+        if refused := [name for name, value in given.items() if value and name not in ("worst", "csv", "latex")]:
+            raise InputError(f"--{refused[0].replace('_', '-')}: {ground_truth} has no ground truth: remove it")
+        worst = results.worst or 0
+        scores = _print_agreement(predictions[0], ground_truth, source, worst, format_options, as_json=as_json)
+    elif len(predictions) > 2:
         raise InputError(f"found {len(predictions)} files of predictions (expected 1, or 2 to compare): leave some out")
-    score: Any = bevcli.evaluate if len(predictions) == 1 else bevcli.compare
-    scores = score(
-        *predictions,
-        ground_truth,
-        options.max_range,
-        options.count_missing,
-        scene=source.scene,
-        class_map=source.class_map,
-        **format_options,
-        **vars(results),
-    )
-    say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
-    for note in scores.notes:
-        print_note(note)
+    else:
+        scored: Any = bevcli.evaluate if len(predictions) == 1 else bevcli.compare
+        scores = scored(
+            *predictions,
+            ground_truth,
+            options.max_range,
+            options.count_missing,
+            scene=source.scene,
+            class_map=source.class_map,
+            **format_options,
+            **vars(results),
+        )
+        say(json.dumps(scores.to_dict(), indent=1) if as_json else scores.table())
+        for note in scores.notes:
+            print_note(note)
     for path, write in ((options.csv, write_csv), (options.latex, write_latex)):
         if path is not None:
             write(scores.tables(), path)
@@ -90,7 +95,7 @@ def _print_agreement(
     format_options: FormatValues,
     *,
     as_json: bool,
-) -> None:
+) -> "Agreement":
     """Print how well boxes agree with a detector in the images of a drive without ground truth."""
     from bevcli.workshop.scores.inputs import open_predictions
     from bevcli.workshop.trust.estimate import agreement_of_boxes, as_document
@@ -99,3 +104,4 @@ def _print_agreement(
     drive = bevcli.open_sequence(path, replace(source, ego_motion="optional"), **format_options)
     found = agreement_of_boxes(file.boxes, drive, file.range_m, worst=worst)
     say(json.dumps(as_document(found, [(drive.name, found)]), indent=1) if as_json else found.table())
+    return found

@@ -1,15 +1,17 @@
 """Agreement: how well boxes in space and the boxes of the witness in the images explain each other.
 
-The score is the harmonic mean of three: the mean overlap of the objects of the witness with their partners, that
-of our boxes with theirs, and kept. Without frames that follow each other, kept counts as 0.5.
+The score is the harmonic mean of two, times kept: the mean fit of the objects of the witness to their partners, and
+that of our boxes to theirs. Without frames half a second apart, kept counts as 0.5.
 """
 
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from bevcli.findings import Finding
 from bevcli.frame import Frame, FrameStamp
@@ -17,16 +19,17 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array
-from bevcli.printing import aligned, number
 from bevcli.workshop.scores.evaluate import finite
+from bevcli.workshop.scores.tables import Cell, Table
 from bevcli.workshop.trust.sightings import GROUPS, NOTHING, PARTNER, Sightings, sightings
 
-NEAR_M, MARGIN_M = 2.0, 4.0  # a box is kept within this distance of where it is expected; it may leave the range
+LEAST_S, MOST_S, MOST_M_S = 0.4, 1.5, 8.0  # between frames that are compared; error of a velocity that counts 0
+MARGIN_M = 4.0  # a box so near to the end of the range may leave it
 RESAMPLES, ENDS = 1000, (5, 95)  # of the seconds; percentiles of the interval
 FEWEST_SECONDS, FEWEST_OBJECTS = 3, 20  # for an interval; for a score without a note
 RINGS_M = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0)
 # What whoever reads a score may hold it against; docs/trust.md says on which drives.
-USUAL = "demo 0.4 to 0.6 on rendered streets, photographs 0.4 to 0.6 on photographs, labels 0.6 to 0.75"
+USUAL = "labels 0.4 to 0.65, demo on rendered streets and photographs anywhere 0.15 to 0.35"
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class FrameAgreement:
         stamp: of the frame.
         ours: the projected boxes that are held against the witness, and those that explain one of its objects.
         theirs: the same of the witness.
-        kept: sums over the boxes: of scores that the next frame keeps, and of scores; zeros where none follows.
+        kept: sums over the boxes: of scores that a frame half a second later keeps, and of scores; zeros without one.
         is_looked_at: whether the witness saw the frame.
     """
 
@@ -59,15 +62,24 @@ class Part:
 
     Attributes:
         found: share of the witness's objects that a projected box explains; NaN without any.
+        objects: number of these objects.
         confirmed: share of the boxes in view that the witness explains; NaN without any.
-        objects: number of the witness's.
-        boxes: number of the boxes in view.
+        boxes: number of these boxes.
     """
 
     found: float
-    confirmed: float
     objects: int
+    confirmed: float
     boxes: int
+
+    @property
+    def row(self) -> tuple[Cell, ...]:
+        """Of a table with PART_COLUMNS."""
+        return self.found, self.objects, self.confirmed, self.boxes
+
+
+PART_COLUMNS = ("found", "of objects", "confirmed", "of boxes")
+NO_PART = Part(np.nan, 0, np.nan, 0)
 
 
 @dataclass(frozen=True)
@@ -95,7 +107,7 @@ class Agreement:
         score: 0 to 1; None where the witness sees nothing.
         low: lower end of the interval of 90 % over resamplings of the seconds; None for fewer than three seconds.
         high: its upper end.
-        kept: share of the boxes that the next frame has where motion leads, each counted by its score; NaN unknown.
+        kept: share of the boxes that are where motion leads half a second later, by their scores; NaN unknown.
         groups: "vehicles", "people" and "cycles" -> their agreement.
         cameras: camera -> agreement of what it shows.
         distances: "0-10 m" and so on -> agreement of what is at this distance from the vehicle, on flat ground.
@@ -133,36 +145,30 @@ class Agreement:
         between = "" if self.low is None else f", between {self.low:.2f} and {self.high:.2f} over its seconds"
         return f"agreement {self.score:.2f}{between} (usual: {USUAL})"
 
-    def table(self, reference: "Agreement | None" = None) -> str:
-        """The score and its parts as text. reference: of another drive, whose numbers stand beside."""
-        sides = [self] if reference is None else [self, reference]
-        lines = [self.line] if reference is None else [self.line, f"reference {reference.line}"]
-        kept = [number(side.kept, 2) for side in sides]
-        lines.append(f"kept {' '.join(kept[:1])}{f' (reference {kept[1]})' if len(kept) > 1 else ''}")
-        rows = ["\n".join(lines)]
+    def tables(self, reference: "Agreement | None" = None) -> Iterator[Table]:
+        """The numbers in tables. reference: of another drive, whose numbers stand beside."""
+        sides, rows = [self] if reference is None else [self, reference], list[tuple[Cell, ...]]()
+        for name, one in zip(("agreement", "reference"), sides, strict=False):
+            shares = (np.nan if value is None else value for value in (one.score, one.low, one.high, one.kept))
+            rows.append((name, *shares, *one.frames))
+        names = ("score", "low", "high", "kept")
+        yield Table("agreement", ("", *names, "frames", "looked at"), rows, dict.fromkeys(names, 2))
         for title in ("groups", "cameras", "distances"):
-            cells = [(title, *("found", "of objects", "confirmed", "of boxes") * len(sides))]
-            tables: list[Mapping[str, Part]] = [getattr(side, title) for side in sides]
-            for name in tables[0]:
-                parts = [table.get(name, Part(np.nan, np.nan, 0, 0)) for table in tables]
-                cells.append((name, *(cell for part in parts for cell in _cells(part))))
-            rows.append(aligned(cells))
-        shifts = [("shift of what is seen", "right px", "down px", "scale", "pairs")]
-        shifts += [
-            (name, number(each.right_px, 1), number(each.down_px, 1), number(each.scale, 2), str(each.pairs))
-            for name, each in self.shifts.items()
-        ]
-        rows.append(aligned(shifts))
+            of_sides: list[Mapping[str, Part]] = [getattr(side, title) for side in sides]
+            rows = [(name, *(cell for one in of_sides for cell in one.get(name, NO_PART).row)) for name in of_sides[0]]
+            yield Table(title, (title, *PART_COLUMNS * len(sides)), rows, dict.fromkeys(PART_COLUMNS, 2))
+        columns = ("shift of what is seen", "right px", "down px", "scale", "pairs")
+        rows = [(name, one.right_px, one.down_px, one.scale, one.pairs) for name, one in self.shifts.items()]
+        yield Table("shifts", columns, rows, {"right px": 1, "down px": 1, "scale": 2})
         if self.worst:
-            head = ("worst frames", "objects and boxes without a partner")
-            rows.append(aligned([head, *((f"frame {stamp.index}", str(count)) for stamp, count in self.worst)]))
+            rows = [(f"frame {stamp.index}", count) for stamp, count in self.worst]
+            yield Table("worst frames", ("worst frames", "objects and boxes without a partner"), rows)
+
+    def table(self, reference: "Agreement | None" = None) -> str:
+        """The score and its parts as text. reference: see `tables`."""
         notes = [f"note: {note}" for note in self.notes]
-        found = [f"{finding.severity}: {finding.line}" for finding in self.findings]
-        return "\n\n".join([*rows, *filter(None, ["\n".join([*notes, *found])])])
-
-
-def _cells(part: Part) -> tuple[str, ...]:
-    return number(part.found, 2), str(part.objects), number(part.confirmed, 2), str(part.boxes)
+        notes += [f"{finding.severity}: {finding.line}" for finding in self.findings]
+        return "\n\n".join(filter(None, [self.line, *map(str, self.tables(reference)), "\n".join(notes)]))
 
 
 def compared(
@@ -172,33 +178,34 @@ def compared(
     *,
     has_poses: bool,
 ) -> Iterator[FrameAgreement]:
-    """Each frame's boxes held against what the witness sees, and against the boxes of the next frame.
+    """Each frame's boxes held against what the witness sees, and against the boxes half a second later.
 
     frames: with the boxes of each in the world frame, and what the witness sees, None where it did not look. classes:
     of the boxes. range_m: nothing beyond this distance is counted. has_poses: whether the drive has ego-motion.
     """
-    before: tuple[FrameAgreement, Boxes3D, Array] | None = None
+    waiting = deque[tuple[FrameAgreement, Boxes3D]]()
     for frame, boxes, seen in frames:
         shown = boxes.scored(SHOWN_SCORE)
         sides = (NOTHING, NOTHING) if seen is None else sightings(frame, shown, seen, classes)
         ours, theirs = (replace(side, counted=side.counted & (side.distances < range_m)) for side in sides)
-        now = FrameAgreement(frame.stamp, ours, theirs, is_looked_at=seen is not None)
-        if before is not None:
-            last, own, place = before
-            follows = has_poses and last.stamp.scene == frame.stamp.scene
+        while waiting:
+            last, near = waiting[0]
             seconds = (frame.stamp.timestamp_ns - last.stamp.timestamp_ns) / 1e9
-            near = own[np.linalg.norm(own.centers - place, axis=1) < range_m - MARGIN_M]
+            is_same = last.stamp.scene == frame.stamp.scene
+            if is_same and seconds < LEAST_S:
+                break
+            follows = has_poses and is_same and seconds <= MOST_S
             yield replace(last, kept=kept(near, shown, seconds)) if follows else last
-        before = now, shown, frame.world_from_ego.matrix[:3, 3]
-    if before is not None:
-        yield before[0]
+            waiting.popleft()
+        near = shown[np.linalg.norm(shown.centers - frame.world_from_ego.matrix[:3, 3], axis=1) < range_m - MARGIN_M]
+        waiting.append((FrameAgreement(frame.stamp, ours, theirs, is_looked_at=seen is not None), near))
+    yield from (last for last, _ in waiting)
 
 
 def kept(boxes: Boxes3D, following: Boxes3D, seconds: float) -> tuple[float, float]:
-    """Sums of the scores of boxes that the next frame keeps, and of all of them.
+    """Sums of the scores of boxes that a later frame keeps, and of all of them.
 
-    A box that is off by v m/s from where its velocity leads counts exp(-v / 2), one that is off by 2 m not at all. All
-    boxes are in the world frame.
+    A box that is off by v m/s from where its velocity leads counts 1 - v / 8. All boxes are in the world frame.
     """
     scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
     if not len(boxes) or not len(following):
@@ -206,8 +213,9 @@ def kept(boxes: Boxes3D, following: Boxes3D, seconds: float) -> tuple[float, flo
     there = boxes.centers[:, :2] + np.nan_to_num(boxes.velocities) * seconds
     off_m = np.linalg.norm(there[:, None] - following.centers[:, :2], axis=2)
     off_m[boxes.classes[:, None] != following.classes] = np.inf
-    nearest = off_m.min(axis=1)
-    return float(scores @ np.where(nearest < NEAR_M, np.exp(-nearest / seconds / 2), 0)), float(scores.sum())
+    worth = np.clip(1 - off_m / seconds / MOST_M_S, 0, 1)
+    rows, columns = linear_sum_assignment(worth, maximize=True)
+    return float(scores[rows] @ worth[rows, columns]), float(scores.sum())
 
 
 def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
@@ -256,8 +264,8 @@ def _notes(objects: int) -> Iterator[str]:
 
 
 def _sums(frame: FrameAgreement) -> tuple[float, ...]:
-    """Of the objects and of the boxes the overlaps and their number, then `kept`."""
-    sides = (side.overlaps[side.counted] for side in (frame.theirs, frame.ours))
+    """Of the objects and of the boxes the fits and their number, then `kept`."""
+    sides = (side.fits[side.counted] for side in (frame.theirs, frame.ours))
     return (*(value for each in sides for value in (float(each.sum()), len(each))), *frame.kept)
 
 
@@ -265,12 +273,12 @@ def _score(sums: Array) -> Array:
     """(...,) of sums (..., 6)."""
     found, confirmed, same = (sums[..., i] / np.maximum(sums[..., i + 1], 1e-9) for i in (0, 2, 4))
     same = np.where(sums[..., 5] > 0, same, 0.5)
-    return np.asarray(3 / sum(1 / np.maximum(each, 1e-9) for each in (found, confirmed, same)))
+    return np.asarray(2 * found * confirmed / np.maximum(found + confirmed, 1e-9) * same)
 
 
 def _part(theirs: Sightings, ours: Sightings) -> Part:
     found, confirmed = (float((side.overlaps >= PARTNER).mean()) if len(side) else np.nan for side in (theirs, ours))
-    return Part(found, confirmed, len(theirs), len(ours))
+    return Part(found, len(theirs), confirmed, len(ours))
 
 
 def _shift(pairs: Sightings) -> Shift:

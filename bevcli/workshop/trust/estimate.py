@@ -3,19 +3,20 @@
 `agreement_of_run` and `agreement_of_boxes` take the boxes of a run that is done, or of any file.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bevcli.frame import Drive, Frame
+from bevcli.frame import Drive, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.boxes2d import Boxes2D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
+from bevcli.inference.runner import RunnerState
 from bevcli.parsing.documents import cell_of
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.workshop.scores.inputs import boxes_of_drive, open_predictions
@@ -23,6 +24,7 @@ from bevcli.workshop.trust.agreement import Agreement, FrameAgreement, agreement
 from bevcli.workshop.trust.faults import find_faults
 from bevcli.workshop.trust.witness import load_witness, seen_in_run
 
+Step = tuple[Frame, Prediction, RunnerState[Any]]  # of `Runner.run`
 EVERY, SHORT = 3, 8  # the witness looks at every third frame, at each one of a drive with up to eight
 RANGE_M = 50.0  # of boxes whose file states none
 NO_BOXES = Boxes2D(np.zeros((0, 4)), np.zeros(0, str), np.zeros(0))
@@ -59,6 +61,15 @@ def frames_of_model(model: Model, drive: Drive, *, temporal: bool = True) -> Ite
     return compared(frames(), classes, range_m, has_poses=drive.has_ego_motion)
 
 
+def witnessed(steps: Iterable[Step], drive: Drive) -> Iterator[Step]:
+    """The steps of a run, with what the witness sees as the boxes in the images where the model has no detector."""
+    for frame, prediction, after in steps:
+        if prediction.image_boxes is None:
+            is_looked_at = _is_looked_at(drive.stamps.index(frame.stamp), drive)
+            prediction = replace(prediction, image_boxes=load_witness().seen(frame) if is_looked_at else {})
+        yield frame, prediction, after
+
+
 def agreement_of_run(folder: Path, drive: Drive) -> Agreement:
     """The agreement from the files of a run over a drive. Raises InputError where they cannot be read."""
     file, path = open_predictions(folder), folder / "image_boxes.csv"
@@ -84,20 +95,24 @@ def agreement_of_boxes(
     Raises InputError as `boxes_of_drive`, and where a frame cannot be read.
     """
     of_frames, _ = boxes_of_drive(boxes, drive)
+    looked_at = [_is_looked_at(place, drive) for place in range(len(drive.stamps))]
+    in_run = [seen and seen.get((stamp.index, stamp.timestamp_ns)) for stamp in drive.stamps]
+    if any(there and not looked for there, looked in zip(in_run, looked_at, strict=True)):
+        looked_at = [True] * len(looked_at)  # the model's own detector saw every frame
 
     def frames() -> Iterator[tuple[Frame, Boxes3D, Mapping[str, Boxes2D] | None]]:
-        for place, (stamp, own) in enumerate(zip(drive.stamps, of_frames, strict=True)):
+        for place, own in enumerate(of_frames):
             if own is None:
                 continue
-            if seen is not None:
-                there = seen.get((stamp.index, stamp.timestamp_ns), {})
-                in_cameras = {name: there.get(cell_of(name), NO_BOXES) for name in drive.rig.names}
-                yield drive.ground_truth_frame(place), own, in_cameras
-            elif _is_looked_at(place, drive):
+            if not looked_at[place]:
+                yield drive.ground_truth_frame(place), own, None
+            elif seen is None:
                 frame = drive.load(place)
                 yield frame, own, load_witness().seen(frame)
             else:
-                yield drive.ground_truth_frame(place), own, None
+                there = in_run[place] or {}
+                in_cameras = {name: there.get(cell_of(name), NO_BOXES) for name in drive.rig.names}
+                yield drive.ground_truth_frame(place), own, in_cameras
 
     classes: Mapping[str, ObjectClass] = boxes.classes or NUSCENES_CLASSES
     limit = range_m or RANGE_M

@@ -1,6 +1,6 @@
 """Boxes held against what the witness sees: projected boxes and seen ones of each image, and which are partners."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -18,6 +18,7 @@ GROUPS = ("vehicles", "people", "cycles")
 _OF_COCO = {"car": 0, "truck": 0, "bus": 0, "person": 1, "bicycle": 2, "motorcycle": 2}
 _OF_KIND = {"vehicle": 0, "pedestrian": 1, "cycle": 2}  # of the attributes of a class of objects
 PARTNER = 0.3  # overlap from which on two boxes explain each other
+APART_M = np.array([0.5, 1, 2, 4])  # as `bevcli eval` matches boxes
 SURE, POSSIBLE = 0.4, 0.2  # scores of the witness: of an object, and of one that may confirm a box
 LEAST_PX = 16.0  # height of an object in an image
 EDGE_PX = 2.0  # a seen box that ends this near the edge of the image may go on outside
@@ -41,6 +42,7 @@ class Sightings:
         scores: (N,) 0 to 1.
         counted: (N,) whether it is held against the other side: whole in the image, large enough, and not hidden.
         overlaps: (N,) intersection over union with the partner; 0 without one.
+        fits: (N,) how well it fits its partner, 0 to 1, see `_fits`; of what is seen, times the partner's score.
         partners: (N, 4) corners of the partner; NaN without one.
     """
 
@@ -52,6 +54,7 @@ class Sightings:
     scores: Array
     counted: NDArray[np.bool_]
     overlaps: Array
+    fits: Array
     partners: Array
 
     def __len__(self) -> int:
@@ -156,38 +159,69 @@ def _of_camera(
     is_sure = (certainties >= SURE) & is_whole & (_heights(corners) >= LEAST_PX) & ~rides
 
     table = overlaps(inside, corners) * (groups[:, None] == kinds)
-    rows, columns = linear_sum_assignment(table, maximize=True)
+    fits = _fits(table, boxes, (inside, corners), pose @ camera.ego_from_camera, camera)
+    rows, columns = linear_sum_assignment(fits, maximize=True)
     is_pair = table[rows, columns] > 0
     rows, columns = rows[is_pair], columns[is_pair]
+    overlap, fit = table[rows, columns], fits[rows, columns]
 
-    def pairs(own: NDArray[np.int64], of: NDArray[np.int64], count: int, others: Array) -> tuple[Array, Array]:
-        overlap, partners = np.zeros(count), np.full((count, 4), np.nan)
-        overlap[own], partners[own] = table[rows, columns], others[of]
-        return overlap, partners
+    def pairs(own: NDArray[np.int64], count: int, *values: Array) -> Iterator[Array]:
+        for value, missing in zip(values, (0, 0, np.nan), strict=True):
+            column = np.full((count, *value.shape[1:]), missing, dtype=float)
+            column[own] = value
+            yield column
 
     ours, theirs = (
         (np.full(count, frame.stamp.index), np.full(count, camera.name)) for count in (len(inside), len(corners))
     )
     ground = _ground_distances(camera, corners)
+    of_ours = pairs(rows, len(inside), overlap, fit, corners[columns])
+    of_theirs = pairs(columns, len(corners), overlap, fit * scores[rows], inside[rows])
     return (
-        Sightings(*ours, inside, groups, distances, scores, is_counted, *pairs(rows, columns, len(inside), corners)),
-        Sightings(*theirs, corners, kinds, ground, certainties, is_sure, *pairs(columns, rows, len(corners), inside)),
+        Sightings(*ours, inside, groups, distances, scores, is_counted, *of_ours),
+        Sightings(*theirs, corners, kinds, ground, certainties, is_sure, *of_theirs),
     )
+
+
+def _fits(
+    overlap: Array, boxes: Boxes3D, sides: tuple[Array, Array], world_from_camera: Array, camera: Camera
+) -> Array:
+    """(N, M) how well projected and seen rectangles fit, 0 to 1; 0 without overlap.
+
+    Mean of the overlap (N, M) and of the share of APART_M within which their feet stand from each other, on the plane
+    below the box. boxes: N, world frame. sides: (N, 4) and (M, 4).
+    """
+    origin, floor = world_from_camera[:3, 3], boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2
+    own, seen = (_rays_of_feet(camera, corners) @ world_from_camera[:3, :3].T for corners in sides)
+
+    def places(rays: Array) -> Array:
+        """(N, K, 2) where rays (N, K, 3) meet the plane below each box; inf where they do not."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            steps = (floor[:, None] - origin[2]) / rays[..., 2]
+        return np.asarray(rays[..., :2] * np.where(steps > 0, steps, np.inf)[..., None])
+
+    with np.errstate(invalid="ignore"):
+        off_m = np.linalg.norm(places(own[:, None]) - places(np.broadcast_to(seen, (len(own), *seen.shape))), axis=2)
+    return np.asarray((overlap + (off_m[..., None] < APART_M).mean(axis=-1)) / 2 * (overlap > 0))
 
 
 def _heights(corners: Array) -> Array:
     return np.asarray(corners[:, 3] - corners[:, 1])
 
 
+def _rays_of_feet(camera: Camera, corners: Array) -> Array:
+    """(N, 3) directions in the camera frame to the middle of the lower edges of rectangles (N, 4)."""
+    return camera.rays(np.stack([corners[:, [0, 2]].mean(axis=1), corners[:, 3]], axis=1))
+
+
 def _ground_distances(camera: Camera, corners: Array) -> Array:
     """(N,) distance of what stands on flat ground at the lower edge of a rectangle; inf above the horizon."""
-    feet = np.stack([corners[:, [0, 2]].mean(axis=1), corners[:, 3]], axis=1)
-    rays = camera.rays(feet) @ camera.ego_from_camera[:3, :3].T
+    rays = _rays_of_feet(camera, corners) @ camera.ego_from_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.where(rays[:, 2] < 0, -camera.ego_from_camera[2, 3] / rays[:, 2], np.inf)
     places = camera.ego_from_camera[:2, 3] + rays[:, :2] * steps[:, None]
     return np.nan_to_num(np.linalg.norm(places, axis=1), nan=np.inf, posinf=np.inf)
 
 
-_NO, _NONE = np.zeros(0), np.zeros((0, 4))
-NOTHING = Sightings(_NO.astype(int), _NO.astype(str), _NONE, _NO.astype(int), _NO, _NO, _NO.astype(bool), _NO, _NONE)
+_NO, _NONE, _INDICES = np.zeros(0), np.zeros((0, 4)), np.zeros(0, int)
+NOTHING = Sightings(_INDICES, _NO.astype(str), _NONE, _INDICES, _NO, _NO, _NO.astype(bool), _NO, _NO, _NONE)
