@@ -54,16 +54,20 @@ def scored_tracks(
     frame's frame of reference, metres. ranges_m: class -> range; boxes of other classes are left out. side:
     "predictions" or "ground truth", for messages.
 
-    Returns boxes whose `frames` are places in the order of `time_order`. Raises InputError if a frame has one identity
+    Returns boxes whose `frames` count in the order of scenes and time. Raises InputError if a frame has one identity
     twice.
     """
-    order = time_order(stamps)
-    scored = gather([frames[index] for index in order], ego_xy[order])
+    ranks = {scene: rank for rank, scene in enumerate(dict.fromkeys(stamp.scene for stamp in stamps))}
+    order = sorted(range(len(stamps)), key=lambda index: (ranks[stamps[index].scene], stamps[index].timestamp_ns))
+    sides = [frames[index] for index in order]
+    scored = gather(sides, ego_xy[order])
     instances = scored.column("instances")
     limits = np.array([ranges_m.get(name, -1.0) for name in scored.boxes.classes.tolist()])
     kept = (scored.ranges_m < limits) & (scored.boxes.num_points != 0) & (instances != "")
     rows, names = scored.frames[kept], instances[kept]
-    scores = np.concatenate([_scores(frames[index]) for index in order])[kept]
+    track_scores = [boxes.scores if boxes.track_scores is None else boxes.track_scores for boxes in sides]
+    filled = [np.zeros(len(b)) if s is None else s for b, s in zip(sides, track_scores, strict=True)]
+    scores = np.concatenate(filled)[kept]
     ordered = [stamps[index] for index in order]
     _, scenes = np.unique([stamp.scene for stamp in ordered], return_inverse=True)
     _, name_numbers = np.unique(names, return_inverse=True)
@@ -85,17 +89,6 @@ def _means_of_tracks(tracks: Indices, scores: Array) -> Array:
     _, starts, lengths = np.unique(tracks[order], return_index=True, return_counts=True)
     means = [np.mean(scores[order[start : start + length]]) for start, length in zip(starts, lengths, strict=True)]
     return np.array(means)[tracks]
-
-
-def time_order(stamps: Sequence[FrameStamp]) -> list[int]:
-    """The places of frames ordered by scene (in the order of first appearance), then by time."""
-    order = {scene: number for number, scene in enumerate(dict.fromkeys(stamp.scene for stamp in stamps))}
-    return sorted(range(len(stamps)), key=lambda index: (order[stamps[index].scene], stamps[index].timestamp_ns))
-
-
-def _scores(boxes: Boxes3D) -> Array:
-    scores = boxes.scores if boxes.track_scores is None else boxes.track_scores
-    return np.zeros(len(boxes)) if scores is None else scores
 
 
 def _require_unique(

@@ -193,19 +193,27 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
     predicted, truth = compared.predictions, compared.truth
     assert predicted is not None
     assert truth is not None
-    model_range = _model_range_m(predicted, pairs, classes) if max_range is None else None
+    # Where the model's BEV grid ends, metres; None if unknown, not applicable, or beyond all ranges.
+    model_range, farthest = predicted.range_m, max(object_class.range_m for object_class in classes.values())
+    if max_range is not None or not pairs.ego_pose_known or (model_range or farthest) >= farthest:
+        model_range = None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
     predicted_boxes, true_boxes = pairs.boxes
-    detection = evaluate_detections(_with_attributes(predicted_boxes, classes), true_boxes, config, pairs.ego_xy)
+    scored = predicted_boxes
+    if all(boxes.attributes is None for boxes in scored):
+        scored = [replace(boxes, attributes=attributes_by_speed(boxes, classes)) for boxes in scored]
+    detection = evaluate_detections(scored, true_boxes, config, pairs.ego_xy)
     segmentation, map_notes = _score_maps(predicted, truth, pairs)
     compared = replace(compared, max_range_m=limit, detection=detection)
-    tracking = score_tracks(compared) if results.tracking else None
-    vad = None
-    if results.map or results.motion or results.plan:
-        vad = evaluate_driving(results, compared)
-    worst = find_worst_frames([compared], results.worst) if results.worst else None
-    scores = Scores(detection, segmentation, tracking, vad, worst, pairs=pairs)
+    scores = Scores(
+        detection,
+        segmentation,
+        score_tracks(compared) if results.tracking else None,
+        evaluate_driving(results, compared) if results.map or results.motion or results.plan else None,
+        find_worst_frames([compared], results.worst) if results.worst else None,
+        pairs=pairs,
+    )
     notes = (
         *pairs.notes,
         *map_notes,
@@ -227,12 +235,6 @@ def _range_notes(max_range: float | None, model_range: float | None, pairs: inpu
             f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
             "there (`max_range` (`--max-range M`) sets another limit)"
         )
-
-
-def _with_attributes(frames: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]) -> Sequence[Boxes3D]:
-    if any(boxes.attributes is not None for boxes in frames):
-        return frames
-    return [replace(boxes, attributes=attributes_by_speed(boxes, classes)) for boxes in frames]
 
 
 def _score_maps(
@@ -295,14 +297,6 @@ def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[n
     rows_inside = (row >= 0) & (row < prediction.cells.shape[0])
     predicted = prediction.cells[np.ix_(row[rows_inside], column[columns_inside])]
     return predicted.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()
-
-
-def _model_range_m(
-    predictions: inputs.ScoredInput, pairs: inputs.FramePairs, classes: Mapping[str, ObjectClass]
-) -> float | None:
-    """Distance to the end of the model's BEV grid, metres; None if unknown, not applicable, or beyond all ranges."""
-    range_m, farthest = predictions.range_m, max(object_class.range_m for object_class in classes.values())
-    return range_m if pairs.ego_pose_known and range_m is not None and range_m < farthest else None
 
 
 def _class_notes(

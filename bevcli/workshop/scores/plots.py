@@ -216,13 +216,17 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
     grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
-    radius = _radius(detection)
+    ranges = [boxes.ranges_m for match in detection.matches for boxes in (match.ground_truth, match.predictions)]
+    farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
+    radius = min(10 * np.ceil(farthest / 10), 100.0)
     missed = {name: outcome.missed for name, outcome in outcomes.items()}
     false = {name: outcome.false for name, outcome in outcomes.items()}
     for column, (title, parts) in enumerate((("missed", missed), ("false positives", false))):
         axes = figure.add_subplot(grid[0, column * WORST_FRAMES : (column + 1) * WORST_FRAMES])
         _draw_dots(axes, title, parts, pairs.reference_from_ego, radius)
-    for column, frame in enumerate(_worst_frames(outcomes.values())):
+    mistakes = [boxes.frames for outcome in outcomes.values() for boxes in (outcome.missed, outcome.false)]
+    most = Counter(np.concatenate(mistakes).tolist()).most_common(WORST_FRAMES)
+    for column, (frame, _) in enumerate(most):
         _draw_frame(figure.add_subplot(grid[1, 2 * column : 2 * column + 2]), frame, outcomes.values(), pairs, radius)
     heading = {"title": "class: missed / false positives", "title_fontsize": 9}
     handles = _legend(missed, false)
@@ -237,19 +241,6 @@ def _legend(missed: Mapping[str, ScoredBoxes], false: Mapping[str, ScoredBoxes])
         for name, boxes in missed.items()
     ]
     return dots + [Line2D([], [], color=color, label=label) for label, (color, _) in _OUTLINES.items()]
-
-
-def _radius(detection: DetectionScores) -> float:
-    """The radius that is drawn, metres: that of the farthest box, at most 100."""
-    ranges = [boxes.ranges_m for match in detection.matches for boxes in (match.ground_truth, match.predictions)]
-    farthest = max((float(values.max()) for values in ranges if len(values)), default=10.0)
-    return min(10 * np.ceil(farthest / 10), 100.0)
-
-
-def _worst_frames(outcomes: Iterable[Outcome]) -> list[int]:
-    mistakes = [boxes.frames for outcome in outcomes for boxes in (outcome.missed, outcome.false)]
-    counts = Counter(np.concatenate(mistakes).tolist())
-    return [frame for frame, _ in counts.most_common(WORST_FRAMES)]
 
 
 def _draw_dots(
@@ -277,18 +268,15 @@ def _draw_frame(axes: Axes, frame: int, outcomes: Iterable[Outcome], pairs: Fram
     for outcome in outcomes:
         parts = [scored[scored.frames == frame] for scored in outcome]
         for scored, (color, style) in zip(parts, _OUTLINES.values(), strict=True):
-            _draw_boxes(axes, scored, ego_from_reference, color, style)
+            outlines = [
+                _in_plot(apply(ego_from_reference, corners[[0, 1, 2, 3, 0]])) for corners in scored.boxes.corners()
+            ]
+            axes.add_collection(LineCollection(outlines, colors=color, linestyles=style, linewidths=1.3, zorder=3))
         counts += [len(scored) for scored in parts]
     _draw_ground(axes, radius)
     stamp = pairs.ground_truth[frame].stamp
     scene = f"{stamp.scene} " if stamp.scene else ""
     axes.set_title(f"{scene}frame {stamp.index}\n{counts[1]} missed, {counts[2]} false positives", fontsize=10)
-
-
-def _draw_boxes(axes: Axes, scored: ScoredBoxes, ego_from_reference: Array, color: str, style: str) -> None:
-    outlines = [_in_plot(apply(ego_from_reference, corners[:4])) for corners in scored.boxes.corners()]
-    closed = [np.concatenate([outline, outline[:1]]) for outline in outlines]
-    axes.add_collection(LineCollection(closed, colors=color, linestyles=style, linewidths=1.3, zorder=3))
 
 
 def _draw_ground(axes: Axes, radius: float) -> None:

@@ -107,11 +107,20 @@ def score_class(truth: TrackedBoxes, predictions: TrackedBoxes, config: Tracking
     scores = np.sort(predictions.scores[matched])[::-1]
     thresholds = np.interp(recalls, np.arange(1, len(scores) + 1) / len(truth), scores, right=np.nan)[::-1]
     levels["confidence"], levels["recall_hypo"] = thresholds, recalls[::-1]
+    if np.isnan(thresholds).all():
+        return ClassTracking(_worst(truth), levels)
     for threshold in np.unique(thresholds[~np.isnan(thresholds)]):
         kept, matches = predictions[predictions.scores >= threshold], associate(truth, predictions, pairs, threshold)
         for name, value in _metrics(truth, kept, matches.kinds, matches.distances, config).items():
             levels[name][thresholds == threshold] = value
-    return ClassTracking(_overall(truth, levels), levels)
+    best = int(np.nanargmax(levels["mota"]))  # the first one: the highest recall level
+    motar, motp = levels["motar"], levels["motp"]
+    overall = {
+        "amota": float(np.where(np.isnan(motar), WORST_AMOTA, motar).mean()),
+        "amotp": float(np.where(np.isnan(motp), WORST_AMOTP, motp).mean()),
+        **{name: float(levels[name][best]) for name in WORST},
+    }
+    return ClassTracking(overall, levels)
 
 
 def _metrics(
@@ -176,19 +185,6 @@ def _over_objects(
         "frag": int((np.diff(matches)[same] > 1).sum()),
         "tid": period * float(waits.mean()) if seen.any() else np.nan,
         "lgd": period * float(gaps.mean()) if seen.any() else np.nan,
-    }
-
-
-def _overall(truth: TrackedBoxes, levels: Mapping[str, Array]) -> dict[str, float]:
-    """The metrics at the threshold with the highest MOTA, and the means over all levels."""
-    if np.isnan(levels["mota"]).all():
-        return _worst(truth)
-    best = int(np.nanargmax(levels["mota"]))  # the first one: the highest recall level
-    motar, motp = levels["motar"], levels["motp"]
-    return {
-        "amota": float(np.where(np.isnan(motar), WORST_AMOTA, motar).mean()),
-        "amotp": float(np.where(np.isnan(motp), WORST_AMOTP, motp).mean()),
-        **{name: float(levels[name][best]) for name in WORST},
     }
 
 

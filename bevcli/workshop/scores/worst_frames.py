@@ -3,7 +3,6 @@
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,19 +124,16 @@ class WorstFrames:
         rows: list[list[str | int]] = []
         several = len({frame.stamp.scene for frame in self.frames}) > 1
         for name, indices in self.lists.items():
+            *model, mistake = name.split("_")  # such as "a_missed"
+            heading = " ".join([*map(str.upper, model), "most", mistake])
+            heading = "largest difference" if mistake == "difference" else heading
             for rank, index in enumerate(indices):
                 stamp = self.frames[index].stamp
                 frame = f"{stamp.scene} frame {stamp.index}" if several else f"frame {stamp.index}"
                 counts = (int(self.boxes[index]), *self._counts(index))
-                rows.append(["" if rank else _heading(name), frame, *counts])
+                rows.append(["" if rank else heading, frame, *counts])
         below = f"\n(scores from the largest F1 of each class at {self.distance_m:g} m on)"
         yield Table("worst frames", ("worst frames", "", "boxes", *self._columns()), rows, left=(0, 1), below=below)
-
-
-def _heading(name: str) -> str:
-    """Such as "most missed", "A most missed" and "largest difference"."""
-    *model, mistake = name.split("_")
-    return "largest difference" if mistake == "difference" else " ".join([*map(str.upper, model), "most", mistake])
 
 
 def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
@@ -170,18 +166,14 @@ def _by_frame(parts: Sequence[ScoredBoxes], frame_count: int) -> NDArray[np.int6
 def _command(models: Sequence[Compared]) -> tuple[str, ...]:
     """The words of `bevcli viz` for the boxes on their drive; none if the ground truth is not in a drive."""
     truth, files = models[0].truth, [model.predictions.path for model in models if model.predictions is not None]
-    drive = None if truth is None else _drive_of(truth.path)
-    if drive is None or len(files) < len(models):
+    if truth is None or len(files) < len(models):
+        return ()
+    drive = truth.path.parent if truth.path.name == "ground_truth.json" else truth.path
+    if not is_drive(drive):
         return ()
     boxes = [word for file in files for word in ("--boxes", str(file))]
     selection = [word for name, value in models[0].selection.items() for word in (f"--{name}", value)]
     return ("bevcli", "viz", str(drive), *boxes, *selection)
-
-
-def _drive_of(path: Path) -> Path | None:
-    """The drive of ground truth."""
-    folder = path.parent if path.name == "ground_truth.json" else path
-    return folder if is_drive(folder) else None
 
 
 def _scene_starts(model: Compared) -> dict[str, int]:

@@ -374,7 +374,9 @@ def randomised(images: Tensor, config: RandomisationConfig, image: ImageConfig, 
     if not any(vars(config).values()):
         return images
     x = images.flatten(0, -4)  # (M, 3, H, W)
-    y = _blurred(_recolored(_convolved(x, config, generator), config, image, generator), config, generator)
+    y = _recolored(_convolved(x, config, generator), config, image, generator)
+    blurred = upload(_random_indices(len(y), config.blur, generator), y.device)
+    y = y.index_copy(0, blurred, F.avg_pool2d(y[blurred], 3, 1, padding=1, count_include_pad=False))
     y = _noisy(y, config, image, generator)
     return (y * _inside(x)).view_as(images)
 
@@ -438,11 +440,6 @@ def _recolored(x: Tensor, config: RandomisationConfig, image: ImageConfig, gener
     offset = matrix @ (mean - GREY) + mixing @ (colors * brightness) - (mean - GREY)
     matrix, offset = matrix * std.T / std, offset / std
     return torch.baddbmm(upload(offset, x.device), upload(matrix, x.device), x.flatten(2)).view_as(x)
-
-
-def _blurred(x: Tensor, config: RandomisationConfig, generator: torch.Generator) -> Tensor:
-    index = upload(_random_indices(len(x), config.blur, generator), x.device)
-    return x.index_copy(0, index, F.avg_pool2d(x[index], 3, 1, padding=1, count_include_pad=False))
 
 
 def _noisy(x: Tensor, config: RandomisationConfig, image: ImageConfig, generator: torch.Generator) -> Tensor:

@@ -109,7 +109,8 @@ def detection_loss(
             loss is the mean over the groups.
     """
     truth = padded(targets)
-    logits, codes = (_groups_as_layers(tensor, groups) for tensor in (class_logits, box_codes))
+    # (L, B, groups · Q, ...) -> (L · groups, B, Q, ...)
+    logits, codes = (x.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1) for x in (class_logits, box_codes))
     objects, _ = hungarian_matchings(matching_costs(logits, codes, truth, config), truth.counts)
     classes, boxes = assigned_loss(logits, codes, truth, objects, config).sum(0) / groups
     return {"classes": classes, "boxes": boxes}
@@ -127,11 +128,6 @@ def matching_costs(
         classes = focal_cost(class_logits).gather(-1, labels)
         boxes = torch.cdist(box_codes[..., :VELOCITY_START], truth.codes[..., :VELOCITY_START], p=1)
         return config.class_weight * classes + config.box_weight * boxes
-
-
-def _groups_as_layers(tensor: Tensor, groups: int) -> Tensor:
-    """(L, B, groups · Q, ...) -> (L · groups, B, Q, ...)."""
-    return tensor.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1)
 
 
 def assigned_loss(
@@ -152,18 +148,13 @@ def assigned_loss(
     labels = truth.labels.expand(*leading, -1, -1).gather(-1, object_index)  # (..., B, Q)
     index = object_index[..., None].expand(*object_index.shape, box_codes.shape[-1])
     codes = truth.codes.expand(*leading, -1, -1, -1).gather(-2, index)  # (..., B, Q, 10)
-    qualities = qualities_of(box_codes, codes, config.quality_m) * assigned
-    class_targets = torch.zeros_like(class_logits).scatter_(-1, labels[..., None], qualities[..., None])
+    qualities = box_codes.new_ones(box_codes.shape[:-1])
+    if config.quality_m:
+        qualities = torch.exp((codes[..., :2] - box_codes[..., :2].detach()).norm(dim=-1) / -config.quality_m)
+    class_targets = torch.zeros_like(class_logits).scatter_(-1, labels[..., None], (qualities * assigned)[..., None])
     classes = config.class_weight * focal_loss(class_logits, class_targets).sum((-3, -2, -1))
     boxes = config.box_weight * box_losses(box_codes, codes, assigned, config).sum((-2, -1))
     return torch.stack([classes, boxes], -1) / assigned.sum((-2, -1)).clamp(min=1)[..., None]
-
-
-def qualities_of(predicted: Tensor, truth: Tensor, quality_m: float) -> Tensor:
-    """(...) the class targets of box codes (..., 10): see `DetectionLossConfig.quality_m`. No gradient."""
-    if not quality_m:
-        return predicted.new_ones(predicted.shape[:-1])
-    return torch.exp((truth[..., :2] - predicted[..., :2].detach()).norm(dim=-1) / -quality_m)
 
 
 def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: DetectionLossConfig) -> Tensor:
@@ -227,20 +218,12 @@ def dense_loss(
     """
     truth = padded(targets)
     logits, codes = head(bev)
-    objects = _objects_in_reach(head.centers, truth, config.reach_m)
+    # The nearest object of each cell. Not by a product of matrices, which a GPU may round.
+    distances = torch.cdist(head.centers, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
+    distance, nearest = distances.where(truth.exists[:, None], torch.inf).min(dim=-1)  # (B, Y·X)
+    objects = nearest.where(distance <= config.reach_m, -1)
     classes, boxes = config.weight * assigned_loss(logits, codes, truth, objects, detection)
     return {"cell classes": classes, "cell boxes": boxes}
-
-
-def _objects_in_reach(cells: Tensor, truth: PaddedTargets, reach_m: float) -> Tensor:
-    """(B, Y·X) int64 the nearest object of each cell that is within reach of it, -1 for none.
-
-    cells: (Y·X, 2) centres, metres.
-    """
-    # Not by a product of matrices, which a GPU may round.
-    distances = torch.cdist(cells, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
-    distance, nearest = distances.where(truth.exists[:, None], torch.inf).min(dim=-1)
-    return nearest.where(distance <= reach_m, -1)
 
 
 DICE_SMOOTHING = 1e-3

@@ -17,7 +17,7 @@ import torch
 
 from bevcli.config import TRAINING, as_toml, load_config, read_model_file
 from bevcli.errors import InputError, OutputError
-from bevcli.frame import Drive, Frame
+from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -114,7 +114,9 @@ def look_at(drives: Sequence[Drive], bev_frame: BevFrameConfig) -> DataFacts:
         frames = [frame for frame in frames if frame.ground_truth is not None]
         if not frames:
             raise InputError(f"{drive.name}: has no ground truth boxes (expected for training): leave it out")
-        labelled += [_boxes_bev(frame, bev_frame) for frame in frames]
+        for frame in frames:
+            rig = level_rig(frame.rig, bev_frame.height_m) if bev_frame.level else frame.rig
+            labelled.append(ground_truth_boxes(replace(frame, rig=rig)))
         stamps = [frame.stamp for frame in frames]
         gaps_s += [np.diff([stamps[i].timestamp_ns for i in scene]) / 1e9 for scene in scenes_of(stamps)]
         maps = [frame.ground_truth_map for frame in frames if frame.ground_truth_map is not None]
@@ -131,11 +133,6 @@ def look_at(drives: Sequence[Drive], bev_frame: BevFrameConfig) -> DataFacts:
     reach_m = min(map_reaches, default=0.0)
     centers = np.concatenate([boxes.centers for boxes in labelled])
     return DataFacts(tuple(drives), len(labelled), counts, medians, rigs, rate_hz, centers, reach_m)
-
-
-def _boxes_bev(frame: Frame, bev_frame: BevFrameConfig) -> Boxes3D:
-    rig = level_rig(frame.rig, bev_frame.height_m) if bev_frame.level else frame.rig
-    return ground_truth_boxes(replace(frame, rig=rig))
 
 
 Changes = Mapping[str, Mapping[str, Any]]  # of a model's file: keys of its tables with new values; None removes a key
@@ -178,7 +175,8 @@ def model_table(name: str, preset: Preset, data: DataFacts) -> dict[str, Any]:
     """The contents of a model's file for a data set.
 
     The number of BEV cells and all layers are those of the preset's model, so that its weights fit, except those of
-    its classes and cameras. The settings are for a training that starts from these weights. name: of the new model.
+    its classes and cameras. The BEV range is a square of whole metres that holds most boxes. The settings are for a
+    training that starts from these weights. name: of the new model.
     """
     model, changes_by_table = PRESETS[preset]
     table = copy.deepcopy(read_model_file(model)[0])
@@ -189,12 +187,19 @@ def model_table(name: str, preset: Preset, data: DataFacts) -> dict[str, Any]:
     table |= {"name": name, "classes": official + further, "cameras": list(data.cameras)}
     if further:
         table["class_settings"] = {name: {"like": class_of_size(*data.class_sizes[name])} for name in further}
-    table["rate_hz"] = rate_for(data, table.get("rate_hz", 2.0))
+    table.setdefault("rate_hz", 2.0)
+    if data.rate_hz < NEAREST_RATE * table["rate_hz"]:
+        table["rate_hz"] = float(f"{data.rate_hz:.2g}")
     table["max_gap_s"] = max(table.get("max_gap_s", 2.0), round(2 / table["rate_hz"], 2))
-    table["image"]["size"] = _image_size(data, table["image"]["size"][0])
-    _set_range(table["bev_grid"], data)
+    (width, height), grid = data.image_size, table["bev_grid"]
+    size = min(table["image"]["size"][0], width)
+    table["image"]["size"] = [size, max(1, round(size * height / width))]
+    half = float(max(4, math.ceil(round(data.reach_m, 3))))
+    grid["x_range_m"] = grid["y_range_m"] = [-half, half]
+    (low, high), (z0, z1) = np.percentile(data.centers_bev[:, 2], (1, 99)), grid["z_range_m"]
+    grid["z_range_m"] = [float(min(z0, math.floor(low))), float(max(z1, math.ceil(high)))]
     table["training_rigs"] = rigs_of(data.rigs)
-    if data.map_reach_m < table["bev_grid"]["x_range_m"][1]:
+    if data.map_reach_m < half:
         table["heads"] = ["detection"]
         table.pop("segmentation", None)
     training = table.setdefault(TRAINING, {})
@@ -206,11 +211,6 @@ def model_table(name: str, preset: Preset, data: DataFacts) -> dict[str, Any]:
     return table
 
 
-def rate_for(data: DataFacts, preset_hz: float) -> float:
-    """The frame rate to train at: the preset's, or that of data with fewer frames."""
-    return preset_hz if data.rate_hz >= NEAREST_RATE * preset_hz else float(f"{data.rate_hz:.2g}")
-
-
 def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> None:
     for name in path.split("."):
         table = table.setdefault(name, {})
@@ -219,22 +219,6 @@ def _change(table: dict[str, Any], path: str, changes: Mapping[str, Any]) -> Non
             table.pop(key, None)
         else:
             table[key] = value
-
-
-def _image_size(data: DataFacts, width_px: int) -> list[int]:
-    """The preset's width, or that of smaller images, with the data's aspect ratio."""
-    width, height = data.image_size
-    size = min(width_px, width)
-    return [size, max(1, round(size * height / width))]
-
-
-def _set_range(grid: dict[str, Any], data: DataFacts) -> None:
-    """A square of whole metres that holds most boxes, with as many cells as before; a higher one if it is needed."""
-    half = float(max(4, math.ceil(round(data.reach_m, 3))))
-    grid["x_range_m"] = grid["y_range_m"] = [-half, half]
-    low, high = np.percentile(data.centers_bev[:, 2], (1, 99))
-    z0, z1 = grid["z_range_m"]
-    grid["z_range_m"] = [float(min(z0, math.floor(low))), float(max(z1, math.ceil(high)))]
 
 
 LONGEST_S = 10.0  # of the measurement of the cost; an update that takes longer is still finished
@@ -390,11 +374,6 @@ def measure_cost(job: TrainingJob, longest_s: float = LONGEST_S) -> Cost:
     return Cost(job.config, machine, update_s, reading_s, peak_memory(job.device))
 
 
-def class_of_size(length: float, width: float, height: float) -> str:
-    """The nuScenes class whose boxes are most alike to one of this size, in metres, by the ratios of their sides."""
-    size = length, width, height
-
-    def difference(name: str) -> float:
-        return sum(abs(math.log(a / b)) for a, b in zip(NUSCENES_SIZES[name], size, strict=True))
-
-    return min(NUSCENES_SIZES, key=difference)
+def class_of_size(*size: float) -> str:
+    """The nuScenes class whose boxes are most alike to one of this length, width and height, by their ratios."""
+    return min(NUSCENES_SIZES, key=lambda name: np.abs(np.log(np.divide(NUSCENES_SIZES[name], size))).sum())

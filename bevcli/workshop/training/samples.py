@@ -12,7 +12,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
@@ -42,7 +42,6 @@ from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import (
     UNDISTORTED,
     AugmentationConfig,
-    ColorChange,
     augmented,
     distorted,
     distorted_images,
@@ -235,7 +234,11 @@ def load_batch(
         world_from_bev = torch.from_numpy(np.array(poses))
         targets = tuple(frame_targets(x.frame, config) for x in prepared[0 if learn_all else -1 :])
         before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
-        distortions = tuple(map(_distortions, prepared, drawn)) if in_bytes and augmentation.photometric else ()
+        distortions = tuple(
+            torch.tensor([[changes.get(name, UNDISTORTED) for name in x.assignment.cameras]])  # (1, N, 4)
+            for x, changes in zip(prepared, drawn, strict=True)
+            if in_bytes and augmentation.photometric
+        )
         return Batch(inputs, world_from_bev, targets, before, distortions)
 
     return joined([load_clip(clip) for clip in clips])
@@ -256,11 +259,6 @@ def joined(batches: Sequence[Batch]) -> Batch:
 def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
     written: dict[str, Any] = {"write": write_bytes, "dtype": np.uint8} if in_bytes else {}
     return [*map(Preprocessor(config, threads=1, **written), clip)]
-
-
-def _distortions(prepared: PreparedFrame, drawn: Mapping[str, ColorChange]) -> Tensor:
-    """(1, N, 4) those of the images of a frame."""
-    return torch.tensor([[drawn.get(name, UNDISTORTED) for name in prepared.assignment.cameras]])
 
 
 def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInputs, ...]:

@@ -246,9 +246,7 @@ def score_frames(
         evaluate_detections(*_sides([pair for of_drive in boxes for pair in of_drive]), config),
         evaluate_segmentation(maps) if maps else None,
         score_tracks(Compared(_pairs(tracks), classes, range_m)) if tracked else None,
-        drives=tuple(_drive_scores(drives.open(index), boxes[index], config) for index in range(len(boxes)))
-        if each_drive
-        else (),
+        drives=tuple(_each_drive(drives, boxes, config)) if each_drive else (),
     )
 
 
@@ -256,9 +254,12 @@ def _sides(pairs: list[tuple[Boxes3D, Boxes3D]]) -> tuple[list[Boxes3D], list[Bo
     return [predicted for predicted, _ in pairs], [true for _, true in pairs]
 
 
-def _drive_scores(drive: Drive, boxes: list[tuple[Boxes3D, Boxes3D]], config: DetectionConfig) -> DriveScores:
-    table = evaluate_detections(*_sides(boxes), config).overall.of_classes_with_ground_truth()
-    return DriveScores(drive.name, len(drive.rig.cameras), table.mean_ap, table.nd_score)
+def _each_drive(
+    drives: Drives, boxes: Sequence[list[tuple[Boxes3D, Boxes3D]]], config: DetectionConfig
+) -> Iterator[DriveScores]:
+    for drive, of_drive in zip(map(drives.open, range(len(drives))), boxes, strict=True):
+        table = evaluate_detections(*_sides(of_drive), config).overall.of_classes_with_ground_truth()
+        yield DriveScores(drive.name, len(drive.rig.cameras), table.mean_ap, table.nd_score)
 
 
 def drives_table(drives: Sequence[DriveScores]) -> str:
@@ -329,7 +330,9 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
-    _draw_rows(right, [_scores(row) for row in validation.rows], skipped=("step",), marker="o")
+    shown = ("step", "mAP", "NDS")
+    scores = [{k: v for k, v in row.items() if k in shown or k.startswith("IoU")} for row in validation.rows]
+    _draw_rows(right, scores, skipped=("step",), marker="o")
     left.set(title="Training loss", xlabel="step", yscale="log")
     right.set(title="Validation", xlabel="step")
     right.set_ylim(bottom=0)
@@ -345,10 +348,6 @@ def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str
     if rows:
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves
     axes.grid(alpha=0.3)
-
-
-def _scores(row: Row) -> Row:
-    return {name: row[name] for name in row if name in ("step", "mAP", "NDS") or name.startswith("IoU")}
 
 
 def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:

@@ -200,7 +200,12 @@ def named_rows(checkpoint: Checkpoint, model: Network, drives: Drives) -> dict[s
     """
     config = model.config
     classes, cameras = _names(checkpoint, config, "classes"), _names(checkpoint, config, "cameras")
-    rows = dict.fromkeys(_class_keys(model), NamedRows("class rows", classes, _likes(config, classes)))
+    likes = {name: settings.like for name, settings in config.class_settings.items()}
+    starts_of_classes = {
+        name: next(((label,) for label in (name, likes.get(name, "")) if label in classes), ())
+        for name in config.classes
+    }
+    rows = dict.fromkeys(_class_keys(model), NamedRows("class rows", classes, starts_of_classes))
     if model.image_tokens.camera_embedding is not None:
         starts, remark = _views(config.cameras, cameras, drives), "; by heading where it is known; all are trained"
         rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
@@ -228,12 +233,6 @@ def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes",
     if models and (name is None or name in models):
         return tuple(getattr(load_config(models[0]), what))
     return tuple(getattr(config, what)) if name == config.name else ()
-
-
-def _likes(config: ModelConfig, source: tuple[str, ...]) -> Starts:
-    settings = config.class_settings
-    likes = {name: settings[name].like if name in settings else "" for name in config.classes}
-    return {name: next(((label,) for label in (name, like) if label in source), ()) for name, like in likes.items()}
 
 
 def _views(cameras: tuple[str, ...], source: tuple[str, ...], drives: Drives) -> Starts:
