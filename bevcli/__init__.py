@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.engines.exported import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.formats.export import export as export
-    from bevcli.workshop.hub.pack import pack_model as pack_model
+    from bevcli.workshop.hub import pack_model as pack_model
     from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.scores.evaluate import evaluate as evaluate

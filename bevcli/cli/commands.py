@@ -132,7 +132,7 @@ def project_debug(
         input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
     )
     if options.motion and not check.errors:
-        from bevcli.workshop.calibration.core_options import check_motion
+        from bevcli.workshop.calibration.in_turn import check_motion
 
         if options.sequence is not None:
             drive_options["calibration"] = input

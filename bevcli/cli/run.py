@@ -73,7 +73,7 @@ def run(
     source = source.for_model(loaded.config, temporal=run_options.temporal)
     drive = open_with_bar(sequence, source, format_options)
     if calibrate:
-        from bevcli.workshop.calibration.core_options import corrected
+        from bevcli.workshop.calibration.in_turn import corrected
 
         drive = corrected(drive)
     loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "", report=print_note)

@@ -166,7 +166,7 @@ def pack(
     huggingface_hub does that. `--model hf:OWNER/NAME` then loads the model, equal to the last bit, and
     `--model hf:./DIR` before.
     """
-    from bevcli.workshop.hub.pack import pack_model
+    from bevcli.workshop.hub import pack_model
 
     files, notes = pack_model(name, out, options)
     for note in notes:

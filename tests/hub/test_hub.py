@@ -23,8 +23,7 @@ from bevcli.errors import BevcliError, InputError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
 from bevcli.weights import fetch
-from bevcli.workshop.hub.download import import_hub
-from bevcli.workshop.hub.pack import pack_model
+from bevcli.workshop.hub import import_hub, pack_model
 
 FIRST, SECOND = "1" * 40, "2" * 40
 

@@ -33,7 +33,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
 from bevcli.sequences.view import select
 from bevcli.workshop.calibration import calibrate
-from bevcli.workshop.calibration.core_options import check_motion as check
+from bevcli.workshop.calibration.in_turn import check_motion as check
 from bevcli.workshop.odometry import compare as comparing
 from bevcli.workshop.odometry.compare import (
     chosen_frames,

@@ -14,9 +14,8 @@ from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid, rotation_about_z
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
-from bevcli.workshop.odometry.flow import road_flow
 from bevcli.workshop.odometry.measure import Chain, MeasuredStep, MotionMeter, leaps
-from bevcli.workshop.odometry.step_views import CELL_M, SHAPE, RoadPicture, motion_of, next_slopes
+from bevcli.workshop.odometry.step_views import CELL_M, SHAPE, RoadPicture, motion_of, next_slopes, road_flow
 from bevcli.workshop.odometry.steps import (
     CHANCE,
     Candidate,

@@ -8,9 +8,9 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.workshop.synth.catalog import Assets, draw_body
 from bevcli.workshop.synth.city import STOP_LINE_M, CityPlan
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame
-from bevcli.workshop.synth.looks import bent, recoloured
 from bevcli.workshop.synth.mesh import linear
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig
+from bevcli.workshop.synth.scenery import bent, recoloured
 from bevcli.workshop.synth.simulation import Roadside, StandingActor
 
 VEHICLES = ("car", "truck", "construction_vehicle", "bus", "trailer", "motorcycle", "bicycle")

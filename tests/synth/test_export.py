@@ -18,8 +18,8 @@ from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, read_lin
 from bevcli.workshop.synth import Weather, parse_resolution
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive, render as render_sequence
-from bevcli.workshop.synth.looks import WEATHER_NAMES
 from bevcli.workshop.synth.rig import nuscenes_like_rig, rig_for_rendering
+from bevcli.workshop.synth.scenery import WEATHER_NAMES
 
 
 def test_reading_the_folder_gives_the_rendered_frames(written: tuple[RenderedDrive, Path], rendered: RenderedFrame):

@@ -40,6 +40,7 @@ from bevcli.workshop.bevformer_v2.window import (
     ClipMemory,
     FeatureWindow,
     FrameFeatures,
+    WindowForm,
     WindowFrame,
     fill_window,
     frames_at,
@@ -144,8 +145,6 @@ class BEVFormerV2(Network):
     @classmethod
     def export_form(cls, config: ModelConfig, cameras: int) -> Any:
         """See `TemporalModel`."""
-        from bevcli.workshop.bevformer_v2.export import WindowForm
-
         assert isinstance(config, BEVFormerV2Config)
         return WindowForm(config, cameras)
 

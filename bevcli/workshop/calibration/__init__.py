@@ -5,8 +5,8 @@ In the order of the work, on top of the wing `correspondence`, which finds what 
     views                the frame pairs that are used, their grey images, matched points
     road                 the road in both frames of a pair: heights of the cameras, roughly, and points
     calibrate            the entry point: reads a drive, measures in rounds, judges each camera and the whole rig
-    core_options         options of `bevcli run` and `bevcli project-debug`
-    in_turn              the same for a drive without poses, whose motion the wing `odometry` measures
+    in_turn              the same for a drive without poses, whose motion the wing `odometry` measures; the options of
+                         `bevcli run` and `bevcli project-debug`
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A calibration of a drive without poses: its motion and its calibration are measured in turn.
+"""A calibration of a drive without poses, in turn with its motion; the options of `run` and `project-debug`.
 
 The motion in metres follows from the stated heights of the cameras. So their mean stays as it is stated: a rig that is
 higher, on a vehicle that is faster, sees the same. So does a rig that is turned, on a vehicle that drives sideways.
@@ -9,14 +9,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from bevcli.cli.progress import Progress
+from bevcli.findings import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
+from bevcli.printing import say
 from bevcli.sequences.view import DriveView
-from bevcli.workshop.calibration import CalibrateOptions
-from bevcli.workshop.calibration.calibrate import STEPS, CalibrationResult, calibration_steps
-from bevcli.workshop.calibration.estimates import RigEstimate
+from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibration
+from bevcli.workshop.calibration.calibrate import CalibrationResult, calibration_steps
+from bevcli.workshop.calibration.estimates import RigEstimate, Verdict, change_text
 from bevcli.workshop.calibration.views import steps_reached
+from bevcli.workshop.odometry.compare import STEPS, chosen_frames, stated_motion_steps, without_consequences
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.workshop.odometry.report import at_most_rate, check_measured
 
@@ -24,7 +28,7 @@ MOST_ROUNDS = 4
 STILL_DEG, STILL_M = 0.02, 0.002  # changes of a camera from round to round, below which nothing moves any more
 LEAST_STEP_M, FEWEST_STEPS = 0.5, 4  # steps that tell the direction in which the vehicle drives
 MOTION_STEPS = 10  # of progress, in each round
-ALL_STEPS = MOST_ROUNDS * (MOTION_STEPS + STEPS)
+ALL_STEPS = MOST_ROUNDS * (MOTION_STEPS + calibration.STEPS)
 
 
 def calibrate_in_turn(drive: Drive, options: CalibrateOptions) -> Iterator[CalibrationResult | None]:
@@ -92,3 +96,38 @@ def _without_scale(result: CalibrationResult, options: CalibrateOptions) -> RigE
     deviation_m = options.position_m
     whole = replace(result.whole, scale=0.0, scale_deviation=deviation_m / height)
     return replace(whole, height_m=0.0, height_deviation_m=deviation_m)
+
+
+def corrected(drive: Drive) -> Drive:
+    """The drive with its measured calibration; the corrections are printed."""
+    with Progress(calibration.STEPS, "steps of the calibration") as progress:
+        result = calibration.last(progress.over(calibration.calibration_steps(drive, CalibrateOptions())))
+    for camera in result.cameras:
+        reason = change_text(camera) if camera.verdict is Verdict.CORRECTED else camera.reason
+        say(f"calibration: {camera.camera} is {camera.verdict.value}" + (f": {reason}" if reason else ""), err=True)
+    return DriveView(drive, rig=result.rig)
+
+
+def check_motion(drive: Drive | None) -> tuple[Finding, ...]:
+    """Findings about the poses of a drive, and of a short calibration with them; none of a calibration alone (None)."""
+    if drive is None:
+        return ()
+    if _seems_sound(drive):
+        say("poses and calibration fit the images: the long check of them is left out", err=True)
+        return ()
+    with Progress(STEPS + 1 + calibration.STEPS, "steps of the check of poses and calibration") as progress:
+        motion = calibration.last(progress.over(stated_motion_steps(drive)))
+        if errors_of(motion):  # which make a calibration wrong
+            return motion
+        progress.reach(STEPS + 1)
+        measured = calibration.last(progress.over(calibration.motion_steps(drive)))
+    return without_consequences(motion, measured, len(drive.rig.cameras))
+
+
+def _seems_sound(drive: Drive) -> bool:
+    """True where stated poses and calibration fit a few frames so well that the whole check has nothing to find."""
+    if len({stamp.scene for stamp in drive.stamps}) != 1 or not drive.has_ego_motion:
+        return False
+    few = DriveView(drive, chosen_frames(drive))
+    with Progress(calibration.SOUND_STEPS, "steps of the quick check of poses and calibration") as progress:
+        return bool(calibration.last(progress.over(calibration.sound_steps(few))))

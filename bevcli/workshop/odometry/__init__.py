@@ -1,8 +1,7 @@
 """The vehicle's motion, measured from the images and the calibration alone.
 
 In the order of the work:
-    step_views    what is kept of a frame, the points matched in two of them, and what is estimated of a step
-    flow          points of the road in two views from above
+    step_views    what is kept of a frame, points matched in two of them and of the road, what is estimated
     steps         votes how far the vehicle drove, and the motions that fit matched points and points of the road
     measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig
     report        the measured motion in words and files, and the option `odometry` of `open_sequence`

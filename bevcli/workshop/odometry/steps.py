@@ -22,7 +22,6 @@ from bevcli.workshop.correspondence.residuals import (
     values,
 )
 from bevcli.workshop.correspondence.road import RoadPoints, road_points
-from bevcli.workshop.odometry.flow import GroundResiduals, rays_and_weights, road_flow
 from bevcli.workshop.odometry.step_views import (
     BEGIN_M,
     CELL_M,
@@ -35,6 +34,7 @@ from bevcli.workshop.odometry.step_views import (
     SLOPE_RAD,
     SLOPES,
     STATE,
+    GroundResiduals,
     RoadPicture,
     StepUnknowns,
     StepViews,
@@ -42,6 +42,8 @@ from bevcli.workshop.odometry.step_views import (
     match_points,
     moved_picture,
     next_slopes,
+    rays_and_weights,
+    road_flow,
     still_points,
 )
 

@@ -1,7 +1,7 @@
 """The rendered world: drives through a procedural city, with images from any rig and exact ground truth.
 
 meshes     `mesh` (primitives), `road_users`, `catalog` (what stands still; all annotated objects by class)
-world      `city` (streets, blocks, routes), `looks`, `ground`, `traffic`, `simulation` (all actors), `scenery`
+world      `city` (streets, blocks, routes), `scenery` and its looks, `ground`, `traffic`, `simulation` (all actors)
 images     `rig` (cameras and lenses), `shading_kernels`, `photo_kernels`, `material` (a user's photographs), `renderer`
 drives     `drive` (one drive; `render`), `drives` (of a training, a validation, a stress test)
 

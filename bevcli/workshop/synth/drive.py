@@ -27,12 +27,11 @@ from bevcli.workshop.synth import JPEG_QUALITY, RenderOptions
 from bevcli.workshop.synth.catalog import Assets, Body
 from bevcli.workshop.synth.city import CityPlan
 from bevcli.workshop.synth.ground import GroundPlan, GroundTexture, draw_map, paint_ground, true_lines
-from bevcli.workshop.synth.looks import WEATHER_NAMES, Looks, make_weather
 from bevcli.workshop.synth.material import Coats, MaterialFolder, PhotoLooks
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.renderer import RenderedView, ShadowMap, WorldSnapshot, render_through_lens, render_view
 from bevcli.workshop.synth.rig import DrawnRig, lens_parts, nuscenes_like_rig, rig_for_rendering, tilt
-from bevcli.workshop.synth.scenery import Scenery
+from bevcli.workshop.synth.scenery import WEATHER_NAMES, Looks, Scenery, make_weather
 from bevcli.workshop.synth.simulation import Actor, Density, Simulation, draw_density
 from bevcli.workshop.synth.traffic import ActorState, EgoTrack
 

@@ -19,8 +19,8 @@ from bevcli.geometry.object_classes import VEHICLE_CLASSES
 from bevcli.geometry.transforms import Array, apply
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, MapLines, lines_in_area
 from bevcli.workshop.synth.city import CORNER_M, CROSSING_M, STOP_LINE_M, CityPlan, Street, along, rounded_rectangle
-from bevcli.workshop.synth.looks import tiling_noise
 from bevcli.workshop.synth.mesh import Color, linear
+from bevcli.workshop.synth.scenery import tiling_noise
 
 WHITE: Color = (222, 222, 216)
 YELLOW: Color = (214, 170, 54)

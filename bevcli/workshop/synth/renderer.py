@@ -19,10 +19,10 @@ from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.jit import njit
 from bevcli.workshop.synth.ground import GroundTexture
-from bevcli.workshop.synth.looks import Weather
 from bevcli.workshop.synth.material import PhotoView
 from bevcli.workshop.synth.mesh import TriangleSoup
 from bevcli.workshop.synth.rig import LensPart
+from bevcli.workshop.synth.scenery import Weather
 from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT, shade_pixels
 
 # mypy: disable-error-code="no-untyped-def"
