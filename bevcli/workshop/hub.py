@@ -165,23 +165,14 @@ def _check(answer: Any) -> None:
 
 
 class PackedConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """The contents of config.json.
+    """The contents of config.json."""
 
-    Attributes:
-        library_name: "bevcli", by which the Hub tells programs apart.
-        bevcli_version: that packed the model.
-        format: FORMAT.
-        weights: hash and size of model.safetensors.
-        model: contents of the model file, as TOML would have them.
-        limit: a sentence on what the weights are not for, which a run prints; "" for none.
-    """
-
-    library_name: str
-    bevcli_version: str
-    format: int
-    weights: Known
-    model: dict[str, Any]
-    limit: str = ""
+    library_name: str  # "bevcli", by which the Hub tells programs apart
+    bevcli_version: str  # that packed the model
+    format: int  # FORMAT
+    weights: Known  # hash and size of model.safetensors
+    model: dict[str, Any]  # contents of the model file, as TOML would have them
+    limit: str = ""  # a sentence on what the weights are not for, which a run prints; "" for none
 
 
 def read_folder(folder: Path, source: str, mend: str = "pack the model anew") -> HubModel:
@@ -308,25 +299,15 @@ def pack_model(
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a card states beside the model's configuration.
+    """What a card states beside the model's configuration."""
 
-    Attributes:
-        licence: of the weights; "" where none is known.
-        datasets: that the weights were trained on.
-        scores: by name.
-        scored_on: the data of the scores.
-        source: where the weights were published first; "" if that is not known.
-        limit: a sentence on what the weights are not for; "" for none.
-        rigs: the rigs of the training, as the metadata of the weights states them; "" if it does not.
-    """
-
-    licence: str = ""
-    datasets: tuple[str, ...] = ()
-    scores: Mapping[str, float] | None = None
-    scored_on: str = ""
-    source: str = ""
-    limit: str = ""
-    rigs: str = ""
+    licence: str = ""  # of the weights; "" where none is known
+    datasets: tuple[str, ...] = ()  # that the weights were trained on
+    scores: Mapping[str, float] | None = None  # by name
+    scored_on: str = ""  # the data of the scores
+    source: str = ""  # where the weights were published first; "" if that is not known
+    limit: str = ""  # a sentence on what the weights are not for; "" for none
+    rigs: str = ""  # the rigs of the training, as the metadata of the weights states them; "" if it does not
 
     @property
     def missing(self) -> tuple[str, ...]:

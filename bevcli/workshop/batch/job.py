@@ -43,21 +43,14 @@ _KEY_DIGITS = 12
 
 @dataclass(frozen=True)
 class BatchDrive:
-    """One drive of a batch.
+    """One drive of a batch."""
 
-    Attributes:
-        source: path or URL of its folder or file, or of the nuScenes root that contains it.
-        name: short name, for the folder of its results.
-        scene: of a nuScenes root, None for other inputs.
-        input_hash: hash of the name and of names, sizes and versions of the files; "" if they could not be listed.
-        problem: why it cannot be run, "" if nothing is known.
-    """
-
-    source: str
-    name: str
-    scene: str | None = None
+    source: str  # path or URL of its folder or file, or of the nuScenes root that contains it
+    name: str  # short name, for the folder of its results
+    scene: str | None = None  # of a nuScenes root, None for other inputs
+    # hash of the name and of names, sizes and versions of the files; "" if they could not be listed
     input_hash: str = ""
-    problem: str = ""
+    problem: str = ""  # why it cannot be run, "" if nothing is known
 
     def result(self, job_hash: str) -> str:
         """The name of the folder of its results: other input, model, weights or options have another name."""
@@ -202,25 +195,16 @@ Own = TypeVar("Own", bound=Format)
 
 @dataclass(frozen=True)
 class Job:
-    """The model and the options of a batch. On a cluster, the paths in it must exist on every machine.
+    """The model and the options of a batch. On a cluster, the paths in it must exist on every machine."""
 
-    Attributes:
-        out: path or URL of the batch's folder.
-        model: options of `load_model`.
-        source: options of `open_sequence`; the scene is that of the drive.
-        own: options of formats; a format that is missing has its defaults.
-        run: options of `run_into_folder`.
-        evaluate: whether drives with ground truth are scored.
-        retries: further attempts after a drive has failed.
-    """
-
-    out: str
-    model: ModelOptions = field(default_factory=ModelOptions)
+    out: str  # path or URL of the batch's folder
+    model: ModelOptions = field(default_factory=ModelOptions)  # options of `load_model`
+    # options of `open_sequence`; the scene is that of the drive
     source: InputOptions = field(default_factory=InputOptions)
-    own: tuple[Format, ...] = ()
-    run: RunOptions = field(default_factory=RunOptions)
-    evaluate: bool = False
-    retries: int = 2
+    own: tuple[Format, ...] = ()  # options of formats; a format that is missing has its defaults
+    run: RunOptions = field(default_factory=RunOptions)  # options of `run_into_folder`
+    evaluate: bool = False  # whether drives with ground truth are scored
+    retries: int = 2  # further attempts after a drive has failed
 
     def load_model(self) -> Model:
         """The model with its weights. Raises BevcliError."""

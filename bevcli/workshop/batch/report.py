@@ -117,19 +117,12 @@ def to_csv(records: Sequence[Record], classes: Iterable[str]) -> bytes:
 
 @dataclass(frozen=True)
 class DriveMatches:
-    """The part of one drive's scores that the joint scores need.
+    """The part of one drive's scores that the joint scores need."""
 
-    Attributes:
-        frame_count: number of frames that were scored.
-        matches: by class, the matching of its boxes.
-        unmeasured: names of errors whose quantity no ground truth of the drive has.
-        segmentation: the scores of its maps, None without maps.
-    """
-
-    frame_count: int
-    matches: tuple[ClassMatches, ...]
-    unmeasured: tuple[str, ...]
-    segmentation: SegmentationScores | None
+    frame_count: int  # number of frames that were scored
+    matches: tuple[ClassMatches, ...]  # by class, the matching of its boxes
+    unmeasured: tuple[str, ...]  # names of errors whose quantity no ground truth of the drive has
+    segmentation: SegmentationScores | None  # the scores of its maps, None without maps
 
 
 def joint_metrics(out: Storage, records: Sequence[Record], model: ModelConfig) -> dict[str, Any] | None:

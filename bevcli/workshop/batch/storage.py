@@ -30,17 +30,11 @@ LARGEST_RECORD = 1 << 28  # bytes of a small file that is read as a whole
 
 
 class StoredFile(NamedTuple):
-    """A file below a folder.
+    """A file below a folder."""
 
-    Attributes:
-        name: path relative to the folder, with "/".
-        size: bytes.
-        version: modification time or the store's checksum, which change with the contents.
-    """
-
-    name: str
-    size: int
-    version: str
+    name: str  # path relative to the folder, with "/"
+    size: int  # bytes
+    version: str  # modification time or the store's checksum, which change with the contents
 
 
 def is_url(text: str) -> bool:

@@ -53,15 +53,10 @@ OPERATIONS_PER_SAMPLE = 4 * 2 + 2
 
 @dataclass(frozen=True)
 class MachineLimits:
-    """Peak throughput.
+    """Peak throughput."""
 
-    Attributes:
-        gemm_gflops: rate of matrix products, 10^9 operations a second.
-        copy_gbs: rate of copying memory, 10^9 bytes a second, read plus written.
-    """
-
-    gemm_gflops: float
-    copy_gbs: float
+    gemm_gflops: float  # rate of matrix products, 10^9 operations a second
+    copy_gbs: float  # rate of copying memory, 10^9 bytes a second, read plus written
 
     def fastest(self, other: "MachineLimits") -> "MachineLimits":
         """The higher of two measurements; disturbances only make a measurement lower."""
@@ -70,37 +65,21 @@ class MachineLimits:
 
 @dataclass(frozen=True)
 class BenchmarkResult:
-    """All measurements of one model.
+    """All measurements of one model."""
 
-    Attributes:
-        model: its name.
-        device: "cpu" or "cuda".
-        precision: of the prepared model or the exported file.
-        machine: description of processor or GPU, threads and PyTorch's version.
-        stages_s: stage -> seconds of each frame; no two stages ran at the same time.
-        frame_s: seconds of the model's step for each frame, from network inputs to boxes.
-        run_frame_s: median seconds of a frame in a whole run, where other threads decode, preprocess and record.
-        run_over_model: the same, divided by the time of the model alone, which took turns with the runs.
-        peak_memory_bytes: of the process on a CPU, of tensors on a GPU.
-        operations: arithmetic operations of one frame.
-        limits: the machine's peak throughput.
-        comparison: with the plain version, None where that was not run.
-        engine: the program that ran the model.
-    """
-
-    model: str
-    device: str
-    precision: str
-    machine: str
-    stages_s: Mapping[str, tuple[float, ...]]
-    frame_s: tuple[float, ...]
-    run_frame_s: float
-    run_over_model: float
-    peak_memory_bytes: int
-    operations: float
-    limits: MachineLimits
-    comparison: Comparison | None = None
-    engine: str = "torch"
+    model: str  # its name
+    device: str  # "cpu" or "cuda"
+    precision: str  # of the prepared model or the exported file
+    machine: str  # description of processor or GPU, threads and PyTorch's version
+    stages_s: Mapping[str, tuple[float, ...]]  # stage -> seconds of each frame; no two stages ran at the same time
+    frame_s: tuple[float, ...]  # seconds of the model's step for each frame, from network inputs to boxes
+    run_frame_s: float  # median seconds of a frame in a whole run, where other threads decode, preprocess and record
+    run_over_model: float  # the same, divided by the time of the model alone, which took turns with the runs
+    peak_memory_bytes: int  # of the process on a CPU, of tensors on a GPU
+    operations: float  # arithmetic operations of one frame
+    limits: MachineLimits  # the machine's peak throughput
+    comparison: Comparison | None = None  # with the plain version, None where that was not run
+    engine: str = "torch"  # the program that ran the model
 
     @property
     def times_limit(self) -> float:

@@ -300,25 +300,15 @@ def largest_differences(frames: Sequence[tuple[Tensor, Tensor]]) -> tuple[float,
 
 @dataclass(frozen=True)
 class EngineRow:
-    """One engine in one precision.
+    """One engine in one precision."""
 
-    Attributes:
-        engine: its name.
-        precision: of the image features.
-        seconds: of each frame.
-        largest_m: largest distance of a box centre from that of PyTorch in float32, over all object queries.
-        near: share of them that are within 0.1 m, 0 to 1.
-        score: largest difference of scores.
-        problem: why it could not be measured; "" if it was.
-    """
-
-    engine: str
-    precision: str
-    seconds: tuple[float, ...] = ()
-    largest_m: float = 0.0
-    near: float = 1.0
-    score: float = 0.0
-    problem: str = ""
+    engine: str  # its name
+    precision: str  # of the image features
+    seconds: tuple[float, ...] = ()  # of each frame
+    largest_m: float = 0.0  # largest distance of a box centre from that of PyTorch in float32, over all object queries
+    near: float = 1.0  # share of them that are within 0.1 m, 0 to 1
+    score: float = 0.0  # largest difference of scores
+    problem: str = ""  # why it could not be measured; "" if it was
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The configuration of a BEVFormerV2, its memory, the image features of the frames of a window, and its exported form."""
+"""The configuration of a BEVFormerV2, its memory (the image features of a window of frames) and its exported form."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -94,38 +94,23 @@ class BEVFormerV2Config(ModelConfig):
 
 @dataclass(frozen=True)
 class WindowFrame:
-    """One frame of the window of B sequences with N cameras.
+    """One frame of the window of B sequences with N cameras."""
 
-    Attributes:
-        image_features: tokens of the B·N images.
-        image_from_bev: (B, N, 4, 4) float32, from the current frame's bev metres to pixels of this frame's images.
-        has_image: (B, N) bool; a camera without an image sees no BEV cell.
-        image_size: (height, width) of the network's input, pixels.
-    """
-
-    image_features: FeatureMaps
-    image_from_bev: Tensor
-    has_image: Tensor
-    image_size: tuple[int, int]
+    image_features: FeatureMaps  # tokens of the B·N images
+    image_from_bev: Tensor  # (B, N, 4, 4) float32, from the current frame's bev metres to pixels of this frame's images
+    has_image: Tensor  # (B, N) bool; a camera without an image sees no BEV cell
+    image_size: tuple[int, int]  # (height, width) of the network's input, pixels
 
 
 @dataclass(frozen=True)
 class FrameFeatures:
-    """The image features of one frame and where its cameras were.
+    """The image features of one frame and where its cameras were."""
 
-    Attributes:
-        stamp: of the frame.
-        pose: its world_from_ego.
-        image_features: tokens of its N images.
-        image_from_bev: (1, N, 4, 4) float64 on the CPU, from the frame's own bev metres to network pixels.
-        has_image: (1, N) bool.
-    """
-
-    stamp: FrameStamp
-    pose: Pose
-    image_features: FeatureMaps
-    image_from_bev: Tensor
-    has_image: Tensor
+    stamp: FrameStamp  # of the frame
+    pose: Pose  # its world_from_ego
+    image_features: FeatureMaps  # tokens of its N images
+    image_from_bev: Tensor  # (1, N, 4, 4) float64 on the CPU, from the frame's own bev metres to network pixels
+    has_image: Tensor  # (1, N) bool
 
     @staticmethod
     def of(prepared: PreparedFrame, features: FeatureMaps) -> "FrameFeatures":

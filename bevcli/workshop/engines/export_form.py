@@ -150,22 +150,14 @@ DeformableConvolution = Literal["operator", "gridsample"]
 
 @dataclass(frozen=True)
 class SlottedHits:
-    """The cameras that see each cell, in K slots a cell, so that every shape is fixed. A slot may be empty.
+    """The cameras that see each cell, in K slots a cell, so that every shape is fixed. A slot may be empty."""
 
-    Attributes:
-        camera: (Y·X, K) int64, the camera of each slot, any camera where it is empty.
-        filled: (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0.
-        reference_points: (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the
-            padded image.
-        cameras_per_cell: (Y·X, 1) float32, the number of cameras that see a cell, at least 1.
-        most_cameras: (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot.
-    """
-
-    camera: Tensor
-    filled: Tensor
+    camera: Tensor  # (Y·X, K) int64, the camera of each slot, any camera where it is empty
+    filled: Tensor  # (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0
+    # (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the padded image
     reference_points: Tensor
-    cameras_per_cell: Tensor
-    most_cameras: Tensor
+    cameras_per_cell: Tensor  # (Y·X, 1) float32, the number of cameras that see a cell, at least 1
+    most_cameras: Tensor  # (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot
 
 
 class SlottedSpatialCrossAttention(nn.Module):

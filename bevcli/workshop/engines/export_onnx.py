@@ -192,23 +192,14 @@ def _block_of(node: object) -> str:
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """The metadata of an exported file that describes its model.
+    """The metadata of an exported file that describes its model."""
 
-    Attributes:
-        config: of the model.
-        contents: the contents of the model's TOML file, its table of the tracker included.
-        cameras_per_cell: the number of cameras that may see one cell of the BEV map.
-        untrained: whether the weights are random.
-        bundled: whether the weights are those of the package.
-        precision: of backbone and neck, "fp32" or "int8".
-    """
-
-    config: ModelConfig
-    contents: dict[str, Any]
-    cameras_per_cell: int
-    untrained: bool
-    bundled: bool
-    precision: AnyPrecision
+    config: ModelConfig  # of the model
+    contents: dict[str, Any]  # the contents of the model's TOML file, its table of the tracker included
+    cameras_per_cell: int  # the number of cameras that may see one cell of the BEV map
+    untrained: bool  # whether the weights are random
+    bundled: bool  # whether the weights are those of the package
+    precision: AnyPrecision  # of backbone and neck, "fp32" or "int8"
 
 
 def read_metadata(metadata: Mapping[str, str], file: Path) -> ExportedFile:

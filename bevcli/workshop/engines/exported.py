@@ -156,26 +156,16 @@ def load_exported(file: Path, engine: str, threads: int | None = None) -> Export
 
 @dataclass(frozen=True)
 class FrameDifference:
-    """The largest differences between the two runs in one frame.
+    """The largest differences between the two runs in one frame."""
 
-    Attributes:
-        frame: index of the frame.
-        bev: of the BEV map.
-        logits: of the class logits.
-        box_m: of the box centres, metres.
-        near: share of the box centres that differ by at most 0.1 m, 0 to 1.
-        code: of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s.
-        masks: of the probabilities of the map's cells; 0 without segmentation.
-        further: of each output that only this model has, by its name in the file.
-    """
-
-    frame: int
-    bev: float
-    logits: float
-    box_m: float
-    near: float
-    code: float
-    masks: float
+    frame: int  # index of the frame
+    bev: float  # of the BEV map
+    logits: float  # of the class logits
+    box_m: float  # of the box centres, metres
+    near: float  # share of the box centres that differ by at most 0.1 m, 0 to 1
+    code: float  # of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s
+    masks: float  # of the probabilities of the map's cells; 0 without segmentation
+    # of each output that only this model has, by its name in the file
     further: Mapping[str, float] = field(default_factory=dict)
 
 

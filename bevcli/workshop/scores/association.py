@@ -20,21 +20,13 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class TrackedBoxes:
-    """N boxes, ordered by frame.
+    """N boxes, ordered by frame."""
 
-    Attributes:
-        frames: (N,) index of each box's frame, rising; frames of a scene are in the order of time.
-        tracks: (N,) identity, a number from 0 on; the same name in two scenes has two numbers.
-        xy: (N, 2) centre on the ground, metres.
-        classes: (N,) names.
-        scores: (N,) track scores; 0 for ground truth.
-    """
-
-    frames: Indices
-    tracks: Indices
-    xy: Array
-    classes: NDArray[np.str_]
-    scores: Array
+    frames: Indices  # (N,) index of each box's frame, rising; frames of a scene are in the order of time
+    tracks: Indices  # (N,) identity, a number from 0 on; the same name in two scenes has two numbers
+    xy: Array  # (N, 2) centre on the ground, metres
+    classes: NDArray[np.str_]  # (N,) names
+    scores: Array  # (N,) track scores; 0 for ground truth
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -135,17 +127,11 @@ Pairs = tuple[Indices, Indices, Array]  # the same of K pairs, (K,) each; the bo
 
 @dataclass(frozen=True)
 class Association:
-    """The result for every ground-truth box of a class.
+    """The result for every ground-truth box of a class."""
 
-    Attributes:
-        kinds: (G,) MISS, MATCH or SWITCH (a match to another track than the object's last one).
-        partners: (G,) index of the matched prediction, -1 for a miss.
-        distances: (G,) distance to the partner in metres, NaN for a miss.
-    """
-
-    kinds: NDArray[np.int8]
-    partners: Indices
-    distances: Array
+    kinds: NDArray[np.int8]  # (G,) MISS, MATCH or SWITCH (a match to another track than the object's last one)
+    partners: Indices  # (G,) index of the matched prediction, -1 for a miss
+    distances: Array  # (G,) distance to the partner in metres, NaN for a miss
 
 
 def near_pairs(truth: TrackedBoxes, predictions: TrackedBoxes, limit_m: float) -> Pairs:

@@ -41,23 +41,15 @@ def with_all_columns(boxes: Boxes3D) -> Boxes3D:
 
 @dataclass(frozen=True)
 class ClassMatches:
-    """The matching of one class: G ground truths and P predictions at D matching distances.
+    """The matching of one class: G ground truths and P predictions at D matching distances."""
 
-    Attributes:
-        name: of the class.
-        ground_truth: G boxes.
-        predictions: P boxes, sorted by descending score.
-        matched: (D, P), the index of the ground truth that each prediction matches, -1 for a false positive.
-        truth_counts: (G,), bool, the ground truths that are scored.
-        counts: (D, P), bool, the predictions that are scored.
-    """
-
-    name: str
-    ground_truth: ScoredBoxes
-    predictions: ScoredBoxes
+    name: str  # of the class
+    ground_truth: ScoredBoxes  # G boxes
+    predictions: ScoredBoxes  # P boxes, sorted by descending score
+    # (D, P), the index of the ground truth that each prediction matches, -1 for a false positive
     matched: NDArray[np.int64]
-    truth_counts: NDArray[np.bool_]
-    counts: NDArray[np.bool_]
+    truth_counts: NDArray[np.bool_]  # (G,), bool, the ground truths that are scored
+    counts: NDArray[np.bool_]  # (D, P), bool, the predictions that are scored
 
     def within(self, low_m: float, high_m: float) -> ClassMatches:
         """The same matching, scored only from low_m to below high_m from the ego vehicle.
@@ -101,15 +93,10 @@ def match_class(
 
 @dataclass(frozen=True)
 class RecallCurve:
-    """One class at one matching distance.
+    """One class at one matching distance."""
 
-    Attributes:
-        precision: (101,), at RECALLS; 0 beyond the largest recall reached.
-        score: (101,), the score threshold at RECALLS; 0 beyond the largest recall reached.
-    """
-
-    precision: Array
-    score: Array
+    precision: Array  # (101,), at RECALLS; 0 beyond the largest recall reached
+    score: Array  # (101,), the score threshold at RECALLS; 0 beyond the largest recall reached
 
     def average_precision(self, config: DetectionConfig) -> float:
         """AP: the mean precision in excess of min_precision over recalls above min_recall, scaled to 0 to 1."""

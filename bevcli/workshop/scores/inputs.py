@@ -27,23 +27,15 @@ from bevcli.workshop.scores.detection import DetectionScores
 
 @dataclass(frozen=True)
 class ScoredInput:
-    """Predictions or ground truth.
+    """Predictions or ground truth."""
 
-    Attributes:
-        boxes: by frame.
-        path: the boxes file, or the drive.
-        maps: None where there is no folder of maps.
-        open_drive: opens the ground truth as a drive; None of a boxes file.
-        bicycle_racks: by sample token, in the world frame; only of a nuScenes root.
-        impossible_boxes: the number of boxes that were left out: a size of 0 or less, or not finite.
-    """
-
-    boxes: BoxesFile
-    path: Path
-    maps: MapFolder | None = None
-    open_drive: Callable[[], Drive] | None = None
+    boxes: BoxesFile  # by frame
+    path: Path  # the boxes file, or the drive
+    maps: MapFolder | None = None  # None where there is no folder of maps
+    open_drive: Callable[[], Drive] | None = None  # opens the ground truth as a drive; None of a boxes file
+    # by sample token, in the world frame; only of a nuScenes root
     bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
-    impossible_boxes: int = 0
+    impossible_boxes: int = 0  # the number of boxes that were left out: a size of 0 or less, or not finite
 
     @property
     def range_m(self) -> float | None:
@@ -138,25 +130,15 @@ def _true_boxes(frame: Frame) -> FrameBoxes:
 
 @dataclass(frozen=True)
 class FramePairs:
-    """F frames that are scored, in the order of the predictions.
+    """F frames that are scored, in the order of the predictions."""
 
-    Attributes:
-        frame_of_reference: of all boxes, "world", "ego" or "bev".
-        predictions: F frames, without boxes where only the ground truth has the frame.
-        ground_truth: F frames.
-        reference_from_ego: (F, 4, 4), pose of the ego vehicle in the frame of reference.
-        ego_pose_known: whether each frame has an ego pose on at least one side.
-        matched_by: the key by which frames were paired.
-        notes: messages for the user, one line each.
-    """
-
-    frame_of_reference: str
-    predictions: tuple[FrameBoxes, ...]
-    ground_truth: tuple[FrameBoxes, ...]
-    reference_from_ego: Array
-    ego_pose_known: bool
-    matched_by: str
-    notes: tuple[str, ...]
+    frame_of_reference: str  # of all boxes, "world", "ego" or "bev"
+    predictions: tuple[FrameBoxes, ...]  # F frames, without boxes where only the ground truth has the frame
+    ground_truth: tuple[FrameBoxes, ...]  # F frames
+    reference_from_ego: Array  # (F, 4, 4), pose of the ego vehicle in the frame of reference
+    ego_pose_known: bool  # whether each frame has an ego pose on at least one side
+    matched_by: str  # the key by which frames were paired
+    notes: tuple[str, ...]  # messages for the user, one line each
 
     @property
     def boxes(self) -> tuple[list[Boxes3D], list[Boxes3D]]:

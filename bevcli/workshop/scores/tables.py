@@ -21,29 +21,19 @@ _LATEX = str.maketrans(_ESCAPES)
 
 @dataclass(frozen=True)
 class Table:
-    """A table of scores.
+    """A table of scores."""
 
-    Attributes:
-        name: of the table, in files.
-        columns: the heads.
-        rows: cells. NaN is printed as "-"; the columns that name a row (`left`) stay empty where the row before has
-            the same name.
-        digits: column -> decimals of its numbers; 3 for others.
-        signed: columns whose numbers have a sign.
-        left: the columns that name a row, aligned to the left.
-        names: of the columns in CSV; by default their heads.
-        below: printed text below the table.
-        sums: further numbers of all rows, which stand in that text: name -> value.
-    """
-
-    name: str
-    columns: Sequence[str]
+    name: str  # of the table, in files
+    columns: Sequence[str]  # the heads
+    # cells. NaN is printed as "-"; the columns that name a row (`left`) stay empty where the row before has the same
+    # name
     rows: Sequence[Sequence[Cell]]
-    digits: Mapping[str, int] = field(default_factory=dict)
-    signed: Collection[str] = ()
-    left: Collection[int] = (0,)
-    names: Sequence[str] = ()
-    below: str = ""
+    digits: Mapping[str, int] = field(default_factory=dict)  # column -> decimals of its numbers; 3 for others
+    signed: Collection[str] = ()  # columns whose numbers have a sign
+    left: Collection[int] = (0,)  # the columns that name a row, aligned to the left
+    names: Sequence[str] = ()  # of the columns in CSV; by default their heads
+    below: str = ""  # printed text below the table
+    # further numbers of all rows, which stand in that text: name -> value
     sums: Mapping[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:

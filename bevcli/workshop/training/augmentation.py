@@ -36,23 +36,14 @@ MAX_HUE_DEG = 18.0
 
 @dataclass(frozen=True)
 class RandomisationConfig:
-    """The [training.augmentation.randomisation] table: probabilities (0 to 1) of each change of an image.
+    """The [training.augmentation.randomisation] table: probabilities (0 to 1) of each change of an image."""
 
-    Attributes:
-        convolution: a random convolution, 1, 3, 5 or 7 pixels wide, mixed with the image by a random share.
-        contrast: contrast and brightness.
-        color: a gain of each channel.
-        saturation: from an image without colour to stronger colours.
-        blur: the mean of 3 x 3 pixels.
-        noise: independent noise of each pixel and channel.
-    """
-
-    convolution: float = 0.0
-    contrast: float = 0.0
-    color: float = 0.0
-    saturation: float = 0.0
-    blur: float = 0.0
-    noise: float = 0.0
+    convolution: float = 0.0  # a random convolution, 1, 3, 5 or 7 pixels wide, mixed with the image by a random share
+    contrast: float = 0.0  # contrast and brightness
+    color: float = 0.0  # a gain of each channel
+    saturation: float = 0.0  # from an image without colour to stronger colours
+    blur: float = 0.0  # the mean of 3 x 3 pixels
+    noise: float = 0.0  # independent noise of each pixel and channel
 
     def __post_init__(self) -> None:
         wrong = [name for name, share in vars(self).items() if not 0 <= share <= 1]

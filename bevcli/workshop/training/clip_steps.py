@@ -127,14 +127,10 @@ class DistillationLossConfig:
 
 @dataclass(frozen=True)
 class Lesson:
-    """The results of a teacher for one frame of B clips with N cameras.
+    """The results of a teacher for one frame of B clips with N cameras."""
 
-    Attributes:
-        bev: (B, Y·X, C) float32; None where only the features are learned.
-        features: (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned.
-    """
-
-    bev: Tensor | None
+    bev: Tensor | None  # (B, Y·X, C) float32; None where only the features are learned
+    # (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned
     features: tuple[Tensor, ...]
 
 

@@ -36,39 +36,24 @@ OUTLINE_DEPTH_M = 0.1  # the part of a box nearer than this is cut off before th
 
 @dataclass(frozen=True)
 class FeatureLocations:
-    """The S pixels of all feature maps of one image, level by level from fine to coarse, row by row.
+    """The S pixels of all feature maps of one image, level by level from fine to coarse, row by row."""
 
-    Attributes:
-        pixels: (S, 2) x and y of their centres, pixels of the network's input.
-        strides: (L, 2) distance of neighbours along x and y on each level, pixels of the network's input.
-        levels: (S,) int64, the level of each.
-    """
-
-    pixels: Tensor
-    strides: Tensor
-    levels: Tensor
+    pixels: Tensor  # (S, 2) x and y of their centres, pixels of the network's input
+    strides: Tensor  # (L, 2) distance of neighbours along x and y on each level, pixels of the network's input
+    levels: Tensor  # (S,) int64, the level of each
 
 
 @dataclass(frozen=True)
 class ImageObjects:
-    """G boxes as each of P cameras sees them. Only `outlines` and `visible` are valid for a centre behind the camera.
+    """G boxes as each of P cameras sees them; behind the camera only `outlines` and `visible` are valid."""
 
-    Attributes:
-        visible: (P, G) bool, whether any part of the box lies inside the image.
-        outlines: (P, G, 4) left, top, right, bottom of the part inside the image, pixels.
-        centers: (P, G, 2) x and y of the projected box centre, pixels; may lie outside the image.
-        depths: (P, G) of the box centre along the optical axis, metres.
-        focal: (P,) focal length, pixels: the geometric mean of fx and fy.
-        log_sizes: (P, G, 3) logarithms of length, width, height in metres.
-        rotations: (P, G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis.
-    """
-
-    visible: Tensor
-    outlines: Tensor
-    centers: Tensor
-    depths: Tensor
-    focal: Tensor
-    log_sizes: Tensor
+    visible: Tensor  # (P, G) bool, whether any part of the box lies inside the image
+    outlines: Tensor  # (P, G, 4) left, top, right, bottom of the part inside the image, pixels
+    centers: Tensor  # (P, G, 2) x and y of the projected box centre, pixels; may lie outside the image
+    depths: Tensor  # (P, G) of the box centre along the optical axis, metres
+    focal: Tensor  # (P,) focal length, pixels: the geometric mean of fx and fy
+    log_sizes: Tensor  # (P, G, 3) logarithms of length, width, height in metres
+    # (P, G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis
     rotations: Tensor
 
 
@@ -283,25 +268,15 @@ def _branch(channels: int, outputs: int, layers: int) -> nn.Sequential:
 
 @dataclass(frozen=True)
 class PerspectiveLossConfig:
-    """The [training.perspective_loss] table.
+    """The [training.perspective_loss] table."""
 
-    Attributes:
-        weight: of the whole loss; 0 disables it.
-        layers: hidden convolutions of each of the head's two branches.
-        class_weight: of the classes within the loss.
-        offset_weight: of the offsets to the projected centre within the loss.
-        depth_weight: of the log depths within the loss.
-        size_weight: of the log sizes within the loss.
-        rotation_weight: of the rotations within the loss.
-    """
-
-    weight: float = 0.0
-    layers: int = 2
-    class_weight: float = 2.0
-    offset_weight: float = 0.25
-    depth_weight: float = 1.0
-    size_weight: float = 0.25
-    rotation_weight: float = 0.25
+    weight: float = 0.0  # of the whole loss; 0 disables it
+    layers: int = 2  # hidden convolutions of each of the head's two branches
+    class_weight: float = 2.0  # of the classes within the loss
+    offset_weight: float = 0.25  # of the offsets to the projected centre within the loss
+    depth_weight: float = 1.0  # of the log depths within the loss
+    size_weight: float = 0.25  # of the log sizes within the loss
+    rotation_weight: float = 0.25  # of the rotations within the loss
 
     def __post_init__(self) -> None:
         if min(vars(self).values()) < 0:

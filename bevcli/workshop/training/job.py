@@ -36,15 +36,10 @@ from bevcli.writing import write_whole
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """This process among those that train together.
+    """This process among those that train together."""
 
-    Attributes:
-        rank: of this process, 0 to size - 1; the leader has rank 0.
-        size: the number of processes, 1 without torchrun.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # of this process, 0 to size - 1; the leader has rank 0
+    size: int = 1  # the number of processes, 1 without torchrun
 
     @property
     def leads(self) -> bool:
@@ -93,27 +88,17 @@ def join_process_group(device: torch.device) -> ProcessGroup:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """The [training.optimizer] table.
+    """The [training.optimizer] table."""
 
-    Attributes:
-        learning_rate: the peak learning rate.
-        backbone_share: learning rate of the image backbone relative to the rest; 1 for an untrained backbone.
-        weight_decay: of AdamW.
-        warm_up_steps: steps in which the rate rises linearly.
-        warm_up_start: relative rate at step 0.
-        final_share: relative rate at the end of the cosine decay.
-        max_gradient_norm: gradients are clipped to this L2 norm.
-        average: decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is
-            evaluated and released, so that a training may end before its learning rate has decayed.
-    """
-
-    learning_rate: float = 2e-4
-    backbone_share: float = 0.1
-    weight_decay: float = 0.01
-    warm_up_steps: int = 500
-    warm_up_start: float = 1 / 3
-    final_share: float = 1e-3
-    max_gradient_norm: float = 35.0
+    learning_rate: float = 2e-4  # the peak learning rate
+    backbone_share: float = 0.1  # learning rate of the image backbone relative to the rest; 1 for an untrained backbone
+    weight_decay: float = 0.01  # of AdamW
+    warm_up_steps: int = 500  # steps in which the rate rises linearly
+    warm_up_start: float = 1 / 3  # relative rate at step 0
+    final_share: float = 1e-3  # relative rate at the end of the cosine decay
+    max_gradient_norm: float = 35.0  # gradients are clipped to this L2 norm
+    # decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is evaluated
+    # and released, so that a training may end before its learning rate has decayed
     average: float = 0.0
 
     def __post_init__(self) -> None:
@@ -136,40 +121,27 @@ CHECKPOINT = "checkpoint.pt"  # in the output folder
 
 @dataclass(frozen=True)
 class TrainingConfig(LossConfigs):
-    """The [training] table of a model file.
+    """The [training] table of a model file."""
 
-    Attributes:
-        steps: number of steps. A step draws one batch of clips, or `clips.in_turn` batches.
-        held_out: the last drives, so many, are for evaluation only; 0 evaluates on the training drives.
-        evaluate_every: steps between evaluations.
-        checkpoint_every: steps between checkpoints.
-        freeze_batch_norm: keep the running statistics of batch norms, for fine-tuning.
-        frozen_stages: the backbone's stem and its first stages, so many, keep their weights and the statistics of their
-            batch norms; 0 trains all of it.
-        loaders: processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all
-            cores but two.
-        kept_share: share of the free memory (0 to below 1) for decoded images, of all loaders together, so that each
-            loader decodes an image once; 0 keeps none. Batches are the same.
-        weights_dtype: data type of weights.safetensors.
-        clips: how clips are drawn.
-        augmentation: image augmentation.
-        rigs: the rigs of rendered drives.
-        optimizer: AdamW and the learning rate schedule.
-    """
-
-    steps: int = 10_000
-    held_out: int = 2
-    evaluate_every: int = 1000
-    checkpoint_every: int = 250
-    freeze_batch_norm: bool = False
+    steps: int = 10_000  # number of steps. A step draws one batch of clips, or `clips.in_turn` batches
+    held_out: int = 2  # the last drives, so many, are for evaluation only; 0 evaluates on the training drives
+    evaluate_every: int = 1000  # steps between evaluations
+    checkpoint_every: int = 250  # steps between checkpoints
+    freeze_batch_norm: bool = False  # keep the running statistics of batch norms, for fine-tuning
+    # the backbone's stem and its first stages, so many, keep their weights and the statistics of their batch norms; 0
+    # trains all of it
     frozen_stages: int = 0
+    # processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all cores but
+    # two
     loaders: int = 0
+    # share of the free memory (0 to below 1) for decoded images, of all loaders together, so that each loader decodes
+    # an image once; 0 keeps none. Batches are the same
     kept_share: float = 0.25
-    weights_dtype: Literal["float32", "float16"] = "float32"
-    clips: ClipConfig = field(default_factory=ClipConfig)
-    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
-    rigs: RigDistribution = field(default_factory=RigDistribution)
-    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    weights_dtype: Literal["float32", "float16"] = "float32"  # data type of weights.safetensors
+    clips: ClipConfig = field(default_factory=ClipConfig)  # how clips are drawn
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)  # image augmentation
+    rigs: RigDistribution = field(default_factory=RigDistribution)  # the rigs of rendered drives
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)  # AdamW and the learning rate schedule
 
     def __post_init__(self) -> None:
         if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1:
@@ -185,34 +157,21 @@ CORES_OF_TRAINING = 2  # that make no batches, with a GPU
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """Everything that a `Trainer` needs.
+    """Everything that a `Trainer` needs."""
 
-    Attributes:
-        model: is trained in place.
-        config: the [training] table.
-        drives: to train on.
-        held_out: to evaluate on; empty to evaluate on `drives`.
-        out: the output folder, which exists.
-        device: device to train on.
-        seed: determines all random draws, together with the step and the rank of the process.
-        group: the processes that train together.
-        notes: about the drives, for the user.
-        log: where the learning curves are written, besides the CSV files; None for nowhere.
-        warm_starts: what the training starts from; empty for random weights, or if it is resumed.
-        lock: keeps other trainings out of the folder until it is closed; empty in other processes than the leader.
-    """
-
-    model: Network
-    config: TrainingConfig
-    drives: Drives
-    held_out: Drives
-    out: Path
-    device: torch.device
-    seed: int = 0
-    group: ProcessGroup = field(default_factory=ProcessGroup)
-    notes: tuple[str, ...] = ()
-    log: Log | None = None
+    model: Network  # is trained in place
+    config: TrainingConfig  # the [training] table
+    drives: Drives  # to train on
+    held_out: Drives  # to evaluate on; empty to evaluate on `drives`
+    out: Path  # the output folder, which exists
+    device: torch.device  # device to train on
+    seed: int = 0  # determines all random draws, together with the step and the rank of the process
+    group: ProcessGroup = field(default_factory=ProcessGroup)  # the processes that train together
+    notes: tuple[str, ...] = ()  # about the drives, for the user
+    log: Log | None = None  # where the learning curves are written, besides the CSV files; None for nowhere
+    # what the training starts from; empty for random weights, or if it is resumed
     warm_starts: tuple[WarmStart, ...] = ()
+    # keeps other trainings out of the folder until it is closed; empty in other processes than the leader
     lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
     @property

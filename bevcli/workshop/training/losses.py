@@ -172,15 +172,10 @@ def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: Detec
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """The [training.dense_loss] table.
+    """The [training.dense_loss] table."""
 
-    Attributes:
-        weight: of the whole loss; 0 disables it, as published.
-        reach_m: cells up to this distance from an object's centre are positives, metres.
-    """
-
-    weight: float = 0.0
-    reach_m: float = 1.5
+    weight: float = 0.0  # of the whole loss; 0 disables it, as published
+    reach_m: float = 1.5  # cells up to this distance from an object's centre are positives, metres
 
     def __post_init__(self) -> None:
         if self.weight < 0 or self.reach_m <= 0:
@@ -231,19 +226,12 @@ DICE_SMOOTHING = 1e-3
 
 @dataclass(frozen=True)
 class SegmentationLossConfig:
-    """The [training.segmentation_loss] table.
+    """The [training.segmentation_loss] table."""
 
-    Attributes:
-        class_weight: of the focal loss of the classes.
-        location_weight: of the L1 loss of the things' locations.
-        dice_weight: of the dice loss of the masks.
-        pixel_weight: of the focal loss of the masks, averaged over the cells of a mask.
-    """
-
-    class_weight: float = 1.0
-    location_weight: float = 2.0
-    dice_weight: float = 1.0
-    pixel_weight: float = 10.0
+    class_weight: float = 1.0  # of the focal loss of the classes
+    location_weight: float = 2.0  # of the L1 loss of the things' locations
+    dice_weight: float = 1.0  # of the dice loss of the masks
+    pixel_weight: float = 10.0  # of the focal loss of the masks, averaged over the cells of a mask
 
     def __post_init__(self) -> None:
         if min(vars(self).values()) < 0:

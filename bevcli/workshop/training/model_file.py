@@ -58,27 +58,16 @@ NUSCENES_SIZES: Mapping[str, tuple[float, float, float]] = {
 
 @dataclass(frozen=True)
 class DataFacts:
-    """What some drives contain.
+    """What some drives contain."""
 
-    Attributes:
-        drives: the drives, with all their frames.
-        frames: number of frames with ground truth.
-        class_counts: number of boxes by class, the most frequent first.
-        class_sizes: median length, width and height of the boxes by class, metres.
-        rigs: the rig of each drive.
-        rate_hz: median rate of the frames with ground truth, per second.
-        centers_bev: (N, 3) centres of all boxes in the bev frame, metres.
-        map_reach_m: distance that all ground-truth maps cover to each side, metres; 0 without maps.
-    """
-
-    drives: tuple[Drive, ...]
-    frames: int
-    class_counts: dict[str, int]
-    class_sizes: dict[str, tuple[float, float, float]]
-    rigs: tuple[CameraRig, ...]
-    rate_hz: float
-    centers_bev: Array
-    map_reach_m: float
+    drives: tuple[Drive, ...]  # the drives, with all their frames
+    frames: int  # number of frames with ground truth
+    class_counts: dict[str, int]  # number of boxes by class, the most frequent first
+    class_sizes: dict[str, tuple[float, float, float]]  # median length, width and height of the boxes by class, metres
+    rigs: tuple[CameraRig, ...]  # the rig of each drive
+    rate_hz: float  # median rate of the frames with ground truth, per second
+    centers_bev: Array  # (N, 3) centres of all boxes in the bev frame, metres
+    map_reach_m: float  # distance that all ground-truth maps cover to each side, metres; 0 without maps
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -318,21 +307,13 @@ def _facts_lines(data: DataFacts, table: Mapping[str, Any]) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Cost:
-    """The cost of a training.
+    """The cost of a training."""
 
-    Attributes:
-        config: its settings.
-        machine: the device, in words.
-        update_s: time of an update of the weights, while another thread reads the next batch.
-        reading_s: time until the first batch was read, at most; 0 where processes read, for which `update_s` waits.
-        memory_bytes: the largest memory, of the process or of a GPU.
-    """
-
-    config: TrainingConfig
-    machine: str
-    update_s: float
-    reading_s: float
-    memory_bytes: int
+    config: TrainingConfig  # its settings
+    machine: str  # the device, in words
+    update_s: float  # time of an update of the weights, while another thread reads the next batch
+    reading_s: float  # time until the first batch was read, at most; 0 where processes read, for which `update_s` waits
+    memory_bytes: int  # the largest memory, of the process or of a GPU
 
     @property
     def step_s(self) -> float:

@@ -97,15 +97,10 @@ class ClipConfig:
 
 @dataclass(frozen=True)
 class Clip:
-    """Some frames of one drive.
+    """Some frames of one drive."""
 
-    Attributes:
-        drive: index of the drive.
-        frames: indices of the frames in the drive, ascending.
-    """
-
-    drive: int
-    frames: tuple[int, ...]
+    drive: int  # index of the drive
+    frames: tuple[int, ...]  # indices of the frames in the drive, ascending
 
 
 def draw_clip(
@@ -310,29 +305,17 @@ def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | 
 
 @dataclass(frozen=True)
 class BatchMaker:
-    """Makes any batch of a training; it can be pickled.
+    """Makes any batch of a training; it can be pickled."""
 
-    Attributes:
-        drives: to draw clips from.
-        model: the configuration of the model.
-        clips: how clips are drawn.
-        augmentation: of their images.
-        seed: of the training.
-        rank: of this process among those that train together.
-        with_gap: leave out a frame of the clips, see `draw_clips`.
-        plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `write_bytes`.
-    """
-
-    drives: Drives
-    model: ModelConfig
-    clips: ClipConfig
-    augmentation: AugmentationConfig
-    seed: int
-    rank: int
-    with_gap: bool
-    plain: bool
-    in_bytes: bool
+    drives: Drives  # to draw clips from
+    model: ModelConfig  # the configuration of the model
+    clips: ClipConfig  # how clips are drawn
+    augmentation: AugmentationConfig  # of their images
+    seed: int  # of the training
+    rank: int  # of this process among those that train together
+    with_gap: bool  # leave out a frame of the clips, see `draw_clips`
+    plain: bool  # give the clips before augmentation too
+    in_bytes: bool  # give images as bytes, see `write_bytes`
 
     def __call__(self, step: int, turn: int) -> Batch:
         """The batch of a step (0 to `clips.in_turn` - 1 are its turns). It depends on no other batch."""

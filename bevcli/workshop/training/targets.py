@@ -26,32 +26,20 @@ from bevcli.model.upload import exchanged, pinned, tensors_in, upload
 
 @dataclass(frozen=True)
 class DetectionTargets:
-    """The G ground truth boxes of one frame.
+    """The G ground truth boxes of one frame."""
 
-    Attributes:
-        labels: (G,) int64, indices into the model's classes.
-        codes: (G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN.
-    """
-
-    labels: Tensor
-    codes: Tensor
+    labels: Tensor  # (G,) int64, indices into the model's classes
+    codes: Tensor  # (G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN
 
 
 @dataclass(frozen=True)
 class PaddedTargets:
-    """The ground truth boxes of B frames, padded to the G boxes of the frame with the most, at least 1.
+    """The ground truth boxes of B frames, padded to the G boxes of the frame with the most, at least 1."""
 
-    Attributes:
-        labels: (B, G) int64, indices into the model's classes; 0 for padding.
-        codes: (B, G, 10) float32 box codes; 0 for padding.
-        exists: (B, G) bool, false for padding.
-        counts: B numbers of boxes.
-    """
-
-    labels: Tensor
-    codes: Tensor
-    exists: Tensor
-    counts: tuple[int, ...]
+    labels: Tensor  # (B, G) int64, indices into the model's classes; 0 for padding
+    codes: Tensor  # (B, G, 10) float32 box codes; 0 for padding
+    exists: Tensor  # (B, G) bool, false for padding
+    counts: tuple[int, ...]  # B numbers of boxes
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -110,36 +98,23 @@ SAMPLES = 8  # sampling points along each side of a BEV cell
 
 @dataclass(frozen=True)
 class SegmentationTargets:
-    """The masks of one frame: S stuff classes and G vehicles.
+    """The masks of one frame: S stuff classes and G vehicles."""
 
-    Attributes:
-        stuff: (S, Y·X) float32 masks of 0 and 1 in the order of STUFF_CLASSES; None if the frame has no map.
-        things: (G, Y·X) float32 masks of 0 and 1.
-        locations: (G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid.
-    """
-
+    # (S, Y·X) float32 masks of 0 and 1 in the order of STUFF_CLASSES; None if the frame has no map
     stuff: Tensor | None
-    things: Tensor
-    locations: Tensor
+    things: Tensor  # (G, Y·X) float32 masks of 0 and 1
+    locations: Tensor  # (G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid
 
 
 @dataclass(frozen=True)
 class PaddedMasks:
-    """The masks of B frames, padded with zeros to the G vehicles of the frame with the most, at least 1.
+    """The masks of B frames, padded with zeros to the G vehicles of the frame with the most, at least 1."""
 
-    Attributes:
-        stuff: (B, S, Y·X) float32; 0 where a frame has no map.
-        has_stuff: (B,) bool, whether a frame has a map.
-        things: (B, G, Y·X) float32.
-        locations: (B, G, 4) float32.
-        counts: B numbers of vehicles.
-    """
-
-    stuff: Tensor
-    has_stuff: Tensor
-    things: Tensor
-    locations: Tensor
-    counts: tuple[int, ...]
+    stuff: Tensor  # (B, S, Y·X) float32; 0 where a frame has no map
+    has_stuff: Tensor  # (B,) bool, whether a frame has a map
+    things: Tensor  # (B, G, Y·X) float32
+    locations: Tensor  # (B, G, 4) float32
+    counts: tuple[int, ...]  # B numbers of vehicles
 
     def __len__(self) -> int:
         return len(self.counts)

@@ -89,17 +89,11 @@ def _numbers_on_their_way(numbers: Mapping[str, Tensor]) -> Callable[[], dict[st
 
 @dataclass(frozen=True)
 class Progress:
-    """An update of the weights, or the end of a step.
+    """An update of the weights, or the end of a step."""
 
-    Attributes:
-        done: number of steps done.
-        loss: of an update; None at the end of a step.
-        scores: of a validation at the end of the step.
-    """
-
-    done: int
-    loss: float | None = None
-    scores: Validation | None = None
+    done: int  # number of steps done
+    loss: float | None = None  # of an update; None at the end of a step
+    scores: Validation | None = None  # of a validation at the end of the step
 
 
 class Trainer:

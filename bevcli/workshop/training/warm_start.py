@@ -29,18 +29,12 @@ Starts = Mapping[str, tuple[str, ...]]
 
 @dataclass
 class WarmStart:
-    """The numbers that a training loads, those that are new, and those of the file that it does not use.
+    """The numbers that a training loads, those that are new, and those of the file that it does not use."""
 
-    Attributes:
-        file: the weights.
-        source: the model that they are of, as far as the file says; "" if it is not known.
-        model: name or file of the model that is trained.
-        rows: by state, part of the model and reason, how many numbers, and an example.
-    """
-
-    file: Path
-    source: str
-    model: str
+    file: Path  # the weights
+    source: str  # the model that they are of, as far as the file says; "" if it is not known
+    model: str  # name or file of the model that is trained
+    # by state, part of the model and reason, how many numbers, and an example
     rows: dict[tuple[State, str, str], tuple[int, str]] = field(default_factory=dict)
 
     def count(self, state: State, part: str, reason: str, numbers: int, example: str = "") -> None:
@@ -75,20 +69,13 @@ class WarmStart:
 
 @dataclass(frozen=True)
 class NamedRows:
-    """The names of a tensor's rows.
+    """The names of a tensor's rows."""
 
-    Attributes:
-        part: the rows in words.
-        source: names of the file's rows; empty if the file does not name them.
-        starts: name of each row of the model -> the rows of the file that it starts from, as their mean; none for a new
-            one.
-        remark: on rows that start from one of another name.
-    """
-
-    part: str
-    source: tuple[str, ...]
+    part: str  # the rows in words
+    source: tuple[str, ...]  # names of the file's rows; empty if the file does not name them
+    # name of each row of the model -> the rows of the file that it starts from, as their mean; none for a new one
     starts: Starts
-    remark: str = ""
+    remark: str = ""  # on rows that start from one of another name
 
     def fit(self, rows: Tensor, tensor: Tensor) -> bool:
         """The file names the rows of its tensor, and they have the size of the model's."""

@@ -27,49 +27,31 @@ QUERIES_AT_ONCE = 20  # the attention maps of all queries together would need hu
 
 @dataclass(frozen=True)
 class MapHeadConfig:
-    """The map head. The defaults are those of the published weights.
+    """The map head. The defaults are those of the published weights."""
 
-    Attributes:
-        stuff: classes with one mask each.
-        things: classes of instances, in the order of the class logits.
-        thing_queries: T, the number of thing queries.
-        max_things: K, the number of pairs of a query and a class that get a mask, those with the best scores.
-        encoder_layers: layers of the encoder.
-        location_layers: layers of the location decoder.
-        thing_mask_layers: layers of the mask decoder of things.
-        stuff_mask_layers: layers of the mask decoder of stuff.
-        attention_heads: heads of all attentions.
-        points: sampling points of a head of the deformable attentions.
-        attention_levels: feature levels that the deformable attentions are built for. The map head has one map, so 1
-            is plain deformable attention. The published weights were trained with 4, where `FlatListAttention` reads
-            offsets and weights in another order.
-        feed_forward_width: channels inside the feed-forward networks of encoder and location decoder.
-        mask_feed_forward_width: channels inside the feed-forward networks of the mask decoders.
-        dropout: probability in encoder and location decoder, 0 to below 1.
-        min_mask: value of a mask above which a cell belongs to it.
-        min_score: things with a lower score are left out.
-        max_overlap: a thing is left out if a larger share of its cells belongs to things with better scores.
-        thing_offset_m: x, y in metres, bev frame, added to the cells of things: the published weights were trained with
-            lines around the ego origin and drivable area around the lidar, which is 0.94 m further ahead.
-    """
-
-    stuff: tuple[str, ...] = ("drivable_area",)
+    stuff: tuple[str, ...] = ("drivable_area",)  # classes with one mask each
+    # classes of instances, in the order of the class logits
     things: tuple[str, ...] = ("divider", "pedestrian_crossing", "contour")
-    thing_queries: int = 300
-    max_things: int = 100
-    encoder_layers: int = 6
-    location_layers: int = 6
-    thing_mask_layers: int = 4
-    stuff_mask_layers: int = 6
-    attention_heads: int = 8
-    points: int = 4
+    thing_queries: int = 300  # T, the number of thing queries
+    max_things: int = 100  # K, the number of pairs of a query and a class that get a mask, those with the best scores
+    encoder_layers: int = 6  # layers of the encoder
+    location_layers: int = 6  # layers of the location decoder
+    thing_mask_layers: int = 4  # layers of the mask decoder of things
+    stuff_mask_layers: int = 6  # layers of the mask decoder of stuff
+    attention_heads: int = 8  # heads of all attentions
+    points: int = 4  # sampling points of a head of the deformable attentions
+    # feature levels that the deformable attentions are built for. The map head has one map, so 1 is plain deformable
+    # attention. The published weights were trained with 4, where `FlatListAttention` reads offsets and weights in
+    # another order
     attention_levels: int = 4
-    feed_forward_width: int = 512
-    mask_feed_forward_width: int = 1024
-    dropout: float = 0.1
-    min_mask: float = 0.5
-    min_score: float = 0.1
-    max_overlap: float = 0.4
+    feed_forward_width: int = 512  # channels inside the feed-forward networks of encoder and location decoder
+    mask_feed_forward_width: int = 1024  # channels inside the feed-forward networks of the mask decoders
+    dropout: float = 0.1  # probability in encoder and location decoder, 0 to below 1
+    min_mask: float = 0.5  # value of a mask above which a cell belongs to it
+    min_score: float = 0.1  # things with a lower score are left out
+    max_overlap: float = 0.4  # a thing is left out if a larger share of its cells belongs to things with better scores
+    # x, y in metres, bev frame, added to the cells of things: the published weights were trained with lines around the
+    # ego origin and drivable area around the lidar, which is 0.94 m further ahead
     thing_offset_m: tuple[float, float] = (0.0, -0.94)
 
     def __post_init__(self) -> None:
@@ -101,25 +83,17 @@ class MapOutputs:
     """Thing queries, and the masks of the K selected things and of stuff.
 
     A query is selected once for each of its classes that is among the best scores.
-
-    Attributes:
-        class_logits: (B, T, things) of the last layer of the location decoder.
-        locations: (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the
-            map.
-        queries: (B, K) int64, the thing query of each selected thing, by falling score.
-        labels: (B, K) int64, its class, an index into `MapHeadConfig.things`.
-        scores: (B, K), its class score, 0 to 1.
-        thing_masks: (B, K, Y·X), 0 or larger, without an upper limit; the index of a cell is row * columns + column.
-        stuff_masks: (B, S, Y·X), the same for the S stuff classes.
     """
 
-    class_logits: Tensor
+    class_logits: Tensor  # (B, T, things) of the last layer of the location decoder
+    # (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the map
     locations: Tensor
-    queries: Tensor
-    labels: Tensor
-    scores: Tensor
+    queries: Tensor  # (B, K) int64, the thing query of each selected thing, by falling score
+    labels: Tensor  # (B, K) int64, its class, an index into `MapHeadConfig.things`
+    scores: Tensor  # (B, K), its class score, 0 to 1
+    # (B, K, Y·X), 0 or larger, without an upper limit; the index of a cell is row * columns + column
     thing_masks: Tensor
-    stuff_masks: Tensor
+    stuff_masks: Tensor  # (B, S, Y·X), the same for the S stuff classes
 
 
 class MapHead(nn.Module):
@@ -343,21 +317,14 @@ class MaskProjection(nn.Module):
 
 @dataclass(frozen=True)
 class MergedMap:
-    """The classes and the instances of every cell of the BEV grid; rows from the smallest y.
+    """The classes and the instances of every cell of the BEV grid; rows from the smallest y."""
 
-    Attributes:
-        stuff: (S, rows, columns) bool, in the order of `MapHeadConfig.stuff`.
-        things: (classes, rows, columns) bool, in the order of `MapHeadConfig.things`; a cell may have several classes.
-        instances: (rows, columns) int64, the number of a cell's instance from 1, 0 for none.
-        instance_labels: class of each instance, an index into `MapHeadConfig.things`, by falling score.
-        instance_scores: score of each instance, 0 or larger.
-    """
-
-    stuff: NDArray[np.bool_]
+    stuff: NDArray[np.bool_]  # (S, rows, columns) bool, in the order of `MapHeadConfig.stuff`
+    # (classes, rows, columns) bool, in the order of `MapHeadConfig.things`; a cell may have several classes
     things: NDArray[np.bool_]
-    instances: NDArray[np.int64]
-    instance_labels: tuple[int, ...]
-    instance_scores: tuple[float, ...]
+    instances: NDArray[np.int64]  # (rows, columns) int64, the number of a cell's instance from 1, 0 for none
+    instance_labels: tuple[int, ...]  # class of each instance, an index into `MapHeadConfig.things`, by falling score
+    instance_scores: tuple[float, ...]  # score of each instance, 0 or larger
 
     def bev_map(self, grid: BevGrid, config: MapHeadConfig) -> BevMap:
         """The classes without instances, rows from the largest y.

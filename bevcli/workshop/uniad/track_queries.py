@@ -19,26 +19,18 @@ NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego
 
 @dataclass(frozen=True)
 class TrackQueryConfig:
-    """The life of tracks, and the modules that update their queries.
+    """The life of tracks, and the modules that update their queries."""
 
-    Attributes:
-        birth_score: a query without a track starts one with this score or more; a track's misses are forgotten.
-        keep_score: below this score a track has a miss, and is not given out.
-        max_misses: the track ends with this miss.
-        memory_length: number of embeddings that a track remembers.
-        memory_interval: a track saves its embedding at its first frame and then at every such frame.
-        attention_heads: of the memory's attention and of the query interaction.
-        center_range_m: boxes whose centre has a larger |x|, |y| or |z| are left out, bev frame.
-        box_z: height that the box codes state, "center" of the box or its "bottom", as in the released code.
-    """
-
+    # a query without a track starts one with this score or more; a track's misses are forgotten
     birth_score: float = 0.4
-    keep_score: float = 0.35
-    max_misses: int = 5
-    memory_length: int = 4
-    memory_interval: int = 4
-    attention_heads: int = 8
+    keep_score: float = 0.35  # below this score a track has a miss, and is not given out
+    max_misses: int = 5  # the track ends with this miss
+    memory_length: int = 4  # number of embeddings that a track remembers
+    memory_interval: int = 4  # a track saves its embedding at its first frame and then at every such frame
+    attention_heads: int = 8  # of the memory's attention and of the query interaction
+    # boxes whose centre has a larger |x|, |y| or |z| are left out, bev frame
     center_range_m: tuple[float, float, float] = (61.2, 61.2, 10.0)
+    # height that the box codes state, "center" of the box or its "bottom", as in the released code
     box_z: Literal["center", "bottom"] = "bottom"
 
     def __post_init__(self) -> None:
@@ -51,17 +43,11 @@ class TrackQueryConfig:
 
 @dataclass(frozen=True)
 class Memories:
-    """The memories of K tracks.
+    """The memories of K tracks."""
 
-    Attributes:
-        embeddings: (K, M, C), the newest last.
-        is_empty: (K, M) bool, slots without an embedding.
-        wait: (K,) int64 number of frames until the next embedding is saved; 0 saves in this frame.
-    """
-
-    embeddings: Tensor
-    is_empty: Tensor
-    wait: Tensor
+    embeddings: Tensor  # (K, M, C), the newest last
+    is_empty: Tensor  # (K, M) bool, slots without an embedding
+    wait: Tensor  # (K,) int64 number of frames until the next embedding is saved; 0 saves in this frame
 
     def __getitem__(self, selection: Tensor) -> "Memories":
         """The memories of a mask (K,) bool."""
@@ -85,25 +71,15 @@ class Memories:
 
 @dataclass(frozen=True)
 class TrackQueries:
-    """The K tracks of one sequence between two frames.
+    """The K tracks of one sequence between two frames."""
 
-    Attributes:
-        position: (K, C) first half of the queries.
-        content: (K, C) second half of the queries.
-        box_codes: (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.decoder`.
-        ids: (K,) int64 identities.
-        misses: (K,) int64 number of misses since the score was last high.
-        memories: of the K tracks.
-        next_id: identity of the next track. It never falls, so that identities differ between scenes, too.
-    """
-
-    position: Tensor
-    content: Tensor
-    box_codes: Tensor
-    ids: Tensor
-    misses: Tensor
-    memories: Memories
-    next_id: int
+    position: Tensor  # (K, C) first half of the queries
+    content: Tensor  # (K, C) second half of the queries
+    box_codes: Tensor  # (K, 10) boxes of the last frame, in its bev frame; see `bevcli.model.decoder`
+    ids: Tensor  # (K,) int64 identities
+    misses: Tensor  # (K,) int64 number of misses since the score was last high
+    memories: Memories  # of the K tracks
+    next_id: int  # identity of the next track. It never falls, so that identities differ between scenes, too
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -121,15 +97,10 @@ class TrackQueries:
 
 @dataclass(frozen=True)
 class FrameMotion:
-    """The motion since the previous frame.
+    """The motion since the previous frame."""
 
-    Attributes:
-        bev_from_previous_bev: (4, 4) float32, from the previous frame's bev metres to this frame's.
-        seconds: between the two frames.
-    """
-
-    bev_from_previous_bev: Tensor
-    seconds: float
+    bev_from_previous_bev: Tensor  # (4, 4) float32, from the previous frame's bev metres to this frame's
+    seconds: float  # between the two frames
 
 
 def with_tracks(

@@ -38,19 +38,15 @@ from bevcli.workshop.uniad.track_queries import (
 
 @dataclass(frozen=True, kw_only=True)
 class UniADConfig(ModelConfig):
-    """A whole UniAD, first stage. The last one of decoder.queries is the ego query: it describes the own vehicle.
-
-    Attributes:
-        track_queries: the life of tracks, and the modules that update their queries.
-        map_head: the map head.
-    """
+    """A whole UniAD, first stage. The last one of decoder.queries is the ego query: it describes the own vehicle."""
 
     architecture: ClassVar[str] = "UniAD"
     has_tracks: ClassVar[bool] = True
 
     ego_motion: EgoMotionConfig = field(default_factory=lambda: EgoMotionConfig(first_frame="original"))
+    # the life of tracks, and the modules that update their queries
     track_queries: TrackQueryConfig = field(default_factory=TrackQueryConfig)
-    map_head: MapHeadConfig = field(default_factory=MapHeadConfig)
+    map_head: MapHeadConfig = field(default_factory=MapHeadConfig)  # the map head
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,40 +67,25 @@ class UniADConfig(ModelConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class UniADOutputs(ModelOutputs):
-    """The outputs of one step for the N queries of the frame: the learned ones, then those of the tracks.
-
-    Attributes:
-        ids: (N,) int64 identities after births and deaths; NO_TRACK and EGO for queries without one.
-        scores: (N,) the highest class score of each query.
-        tracks: what the next frame needs.
-        map: of the map head; None where it was not asked for.
-    """
+    """The outputs of one step for the N queries of the frame: the learned ones, then those of the tracks."""
 
     stay_on_device: ClassVar[tuple[str, ...]] = ("bev", "tracks", "map")
 
-    ids: Tensor
-    scores: Tensor
-    tracks: TrackQueries
-    map: MapOutputs | None = None
+    ids: Tensor  # (N,) int64 identities after births and deaths; NO_TRACK and EGO for queries without one
+    scores: Tensor  # (N,) the highest class score of each query
+    tracks: TrackQueries  # what the next frame needs
+    map: MapOutputs | None = None  # of the map head; None where it was not asked for
 
 
 @dataclass(frozen=True)
 class TrackMemory:
-    """The memory of a UniAD.
+    """The memory of a UniAD."""
 
-    Attributes:
-        bev: (1, Y·X, C), the BEV map of the last frame; None where a scene has ended.
-        tracks: of the last frame, with their memories.
-        pose: world_from_ego of that frame.
-        ego_from_bev: (4, 4) of that frame.
-        timestamp_ns: of that frame.
-    """
-
-    bev: Tensor | None
-    tracks: TrackQueries
-    pose: Pose
-    ego_from_bev: Array
-    timestamp_ns: int
+    bev: Tensor | None  # (1, Y·X, C), the BEV map of the last frame; None where a scene has ended
+    tracks: TrackQueries  # of the last frame, with their memories
+    pose: Pose  # world_from_ego of that frame
+    ego_from_bev: Array  # (4, 4) of that frame
+    timestamp_ns: int  # of that frame
 
 
 # Keys without effect at inference.

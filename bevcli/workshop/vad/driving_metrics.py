@@ -29,17 +29,12 @@ NO_MATCH = -100.0
 
 @dataclass(frozen=True)
 class LineScores:
-    """The scores of map lines.
+    """The scores of map lines."""
 
-    Attributes:
-        ap: class -> threshold in metres -> average precision, 0 to 1; 0 for a class without true lines.
-        truth_count: class -> number of true lines.
-        frame_count: number of frames.
-    """
-
+    # class -> threshold in metres -> average precision, 0 to 1; 0 for a class without true lines
     ap: Mapping[str, Mapping[float, float]]
-    truth_count: Mapping[str, int]
-    frame_count: int
+    truth_count: Mapping[str, int]  # class -> number of true lines
+    frame_count: int  # number of frames
 
     @property
     def mean_by_class(self) -> dict[str, float]:
@@ -149,25 +144,15 @@ CLASSES = ("car", "pedestrian")
 
 @dataclass
 class MotionSums:
-    """Sums over objects of one class.
+    """Sums over objects of one class."""
 
-    Attributes:
-        truths: true objects whose whole future is known.
-        hits: matched ones of known future whose best mode ends within HIT_M.
-        misses: those whose best mode does not.
-        false_positives: detections that match no object.
-        ade_m: sum of the smallest mean distances of a mode, over `ade_count` objects.
-        fde_m: sum of the smallest last distances of a mode, over hits and misses.
-        ade_count: matched objects with a known future, at least in part.
-    """
-
-    truths: int = 0
-    hits: int = 0
-    misses: int = 0
-    false_positives: int = 0
-    ade_m: float = 0.0
-    fde_m: float = 0.0
-    ade_count: int = 0
+    truths: int = 0  # true objects whose whole future is known
+    hits: int = 0  # matched ones of known future whose best mode ends within HIT_M
+    misses: int = 0  # those whose best mode does not
+    false_positives: int = 0  # detections that match no object
+    ade_m: float = 0.0  # sum of the smallest mean distances of a mode, over `ade_count` objects
+    fde_m: float = 0.0  # sum of the smallest last distances of a mode, over hits and misses
+    ade_count: int = 0  # matched objects with a known future, at least in part
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -260,33 +245,21 @@ class PlannedFrame:
     """One frame with its whole future.
 
     All places are in metres, x to the right and y ahead of the vehicle at the frame's time.
-
-    Attributes:
-        path: (T, 2) planned places.
-        driven: (T, 2) places where the vehicle was.
-        others: T sets of boxes, the true objects at each step.
     """
 
-    path: Array
-    driven: Array
-    others: Sequence[Boxes3D]
+    path: Array  # (T, 2) planned places
+    driven: Array  # (T, 2) places where the vehicle was
+    others: Sequence[Boxes3D]  # T sets of boxes, the true objects at each step
 
 
 @dataclass(frozen=True)
 class PlanScores:
-    """The scores of S planned paths of T steps, S > 0.
+    """The scores of S planned paths of T steps, S > 0."""
 
-    Attributes:
-        distances_m: (S, T), planned to driven.
-        collisions: (S, T), with vehicles and pedestrians.
-        collisions_with_vehicles: (S, T).
-        step_s: seconds of a step.
-    """
-
-    distances_m: Array
-    collisions: NDArray[np.bool_]
-    collisions_with_vehicles: NDArray[np.bool_]
-    step_s: float
+    distances_m: Array  # (S, T), planned to driven
+    collisions: NDArray[np.bool_]  # (S, T), with vehicles and pedestrians
+    collisions_with_vehicles: NDArray[np.bool_]  # (S, T)
+    step_s: float  # seconds of a step
 
     def averaged(self, values: NDArray[np.generic], seconds: float) -> float:
         """The mean over all steps up to a horizon, as ST-P3 and VAD state it. values: an attribute."""

@@ -16,29 +16,17 @@ from bevcli.model.encoder import FeedForward
 
 @dataclass(frozen=True)
 class LineDecoderConfig:
-    """The map decoder.
+    """The map decoder."""
 
-    Attributes:
-        classes: of the lines, in the order of the class logits.
-        lines: number of line queries.
-        line_points: number of points of a line.
-        layers: number of decoder layers.
-        attention_heads: heads of self-attention and of cross-attention.
-        points: sampling points of a head of the cross-attention to the BEV map.
-        feed_forward_width: channels between the two linear layers of the feed-forward network.
-        dropout: probability, 0 to below 1.
-        max_lines: number of lines that are decoded, those with the best scores.
-    """
-
-    classes: tuple[str, ...] = ("divider", "ped_crossing", "boundary")
-    lines: int = 100
-    line_points: int = 20
-    layers: int = 3
-    attention_heads: int = 8
-    points: int = 4
-    feed_forward_width: int = 512
-    dropout: float = 0.1
-    max_lines: int = 50
+    classes: tuple[str, ...] = ("divider", "ped_crossing", "boundary")  # of the lines, in the order of the class logits
+    lines: int = 100  # number of line queries
+    line_points: int = 20  # number of points of a line
+    layers: int = 3  # number of decoder layers
+    attention_heads: int = 8  # heads of self-attention and of cross-attention
+    points: int = 4  # sampling points of a head of the cross-attention to the BEV map
+    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
+    dropout: float = 0.1  # probability, 0 to below 1
+    max_lines: int = 50  # number of lines that are decoded, those with the best scores
 
     def __post_init__(self) -> None:
         if not self.classes or min(self.lines, self.max_lines) < 1 or self.line_points < 2:
@@ -52,17 +40,11 @@ class LineDecoderConfig:
 
 @dataclass(frozen=True)
 class LineOutputs:
-    """The N lines of P points of all L layers.
+    """The N lines of P points of all L layers."""
 
-    Attributes:
-        class_logits: (L, B, N, classes).
-        points: (L, B, N, P, 2) x and y, 0 to 1 over the range of the BEV grid.
-        features: (B, N, P, C) of the points, after the last layer.
-    """
-
-    class_logits: Tensor
-    points: Tensor
-    features: Tensor
+    class_logits: Tensor  # (L, B, N, classes)
+    points: Tensor  # (L, B, N, P, 2) x and y, 0 to 1 over the range of the BEV grid
+    features: Tensor  # (B, N, P, C) of the points, after the last layer
 
 
 class LineDecoder(nn.Module):
@@ -122,26 +104,16 @@ class LineEncoder(nn.Module):
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """The motion head and the planner.
+    """The motion head and the planner."""
 
-    Attributes:
-        modes: M, number of futures of an object.
-        steps: T, number of steps of a future and of a planned path.
-        step_s: seconds of a step.
-        attention_heads: heads of the four attentions.
-        feed_forward_width: channels between the two linear layers of the feed-forward networks.
-        dropout: probability, 0 to below 1.
-        min_line_score: objects attend to lines with a higher score.
-        max_line_distance: objects attend to lines up to this distance, in shares of the range of the BEV grid.
-    """
-
-    modes: int = 6
-    steps: int = 6
-    step_s: float = 0.5
-    attention_heads: int = 8
-    feed_forward_width: int = 512
-    dropout: float = 0.1
-    min_line_score: float = 0.5
+    modes: int = 6  # M, number of futures of an object
+    steps: int = 6  # T, number of steps of a future and of a planned path
+    step_s: float = 0.5  # seconds of a step
+    attention_heads: int = 8  # heads of the four attentions
+    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward networks
+    dropout: float = 0.1  # probability, 0 to below 1
+    min_line_score: float = 0.5  # objects attend to lines with a higher score
+    # objects attend to lines up to this distance, in shares of the range of the BEV grid
     max_line_distance: float = 0.2
 
     def __post_init__(self) -> None:
@@ -156,32 +128,20 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class MapTokens:
-    """The N lines as motion head and planner see them.
+    """The N lines as motion head and planner see them."""
 
-    Attributes:
-        features: (B, N, C), one vector a line.
-        positions: (B, N, 2), one point of each line, 0 to 1 over the range: see `line_positions`.
-        scores: (B, N), of the best class, 0 to 1.
-    """
-
-    features: Tensor
-    positions: Tensor
-    scores: Tensor
+    features: Tensor  # (B, N, C), one vector a line
+    positions: Tensor  # (B, N, 2), one point of each line, 0 to 1 over the range: see `line_positions`
+    scores: Tensor  # (B, N), of the best class, 0 to 1
 
 
 @dataclass(frozen=True)
 class MotionOutputs:
-    """The futures of Q objects.
+    """The futures of Q objects."""
 
-    Attributes:
-        offsets: (B, Q, M, T, 2) movement in each step along x and y of the bev frame, metres.
-        mode_logits: (B, Q, M).
-        features: (B, Q, C), one vector an object, for the planner.
-    """
-
-    offsets: Tensor
-    mode_logits: Tensor
-    features: Tensor
+    offsets: Tensor  # (B, Q, M, T, 2) movement in each step along x and y of the bev frame, metres
+    mode_logits: Tensor  # (B, Q, M)
+    features: Tensor  # (B, Q, C), one vector an object, for the planner
 
 
 class MotionHead(nn.Module):

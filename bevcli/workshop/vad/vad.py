@@ -26,19 +26,13 @@ from bevcli.workshop.vad.plan import Plan
 
 @dataclass(frozen=True, kw_only=True)
 class VADConfig(ModelConfig):
-    """A whole VAD.
-
-    Attributes:
-        commands: of the driver, in the order of the planned paths.
-        line_decoder: the map decoder.
-        motion: the motion head and the planner.
-    """
+    """A whole VAD."""
 
     architecture: ClassVar[str] = "VAD"
 
-    commands: tuple[str, ...] = ("right", "left", "straight")
-    line_decoder: heads.LineDecoderConfig = field(default_factory=heads.LineDecoderConfig)
-    motion: heads.MotionConfig = field(default_factory=heads.MotionConfig)
+    commands: tuple[str, ...] = ("right", "left", "straight")  # of the driver, in the order of the planned paths
+    line_decoder: heads.LineDecoderConfig = field(default_factory=heads.LineDecoderConfig)  # the map decoder
+    motion: heads.MotionConfig = field(default_factory=heads.MotionConfig)  # the motion head and the planner
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -105,17 +99,11 @@ PART_NAMES = (
 
 @dataclass(frozen=True, kw_only=True)
 class VADOutputs(ModelOutputs):
-    """The outputs of one step.
+    """The outputs of one step."""
 
-    Attributes:
-        lines: of the map.
-        motion: the futures of the object queries.
-        plan: (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres.
-    """
-
-    lines: heads.LineOutputs
-    motion: heads.MotionOutputs
-    plan: Tensor
+    lines: heads.LineOutputs  # of the map
+    motion: heads.MotionOutputs  # the futures of the object queries
+    plan: Tensor  # (B, commands, T, 2) movement of the vehicle in each step along x and y of the bev frame, metres
 
     @property
     def by_name(self) -> dict[str, Tensor]:
