@@ -25,15 +25,11 @@ ClipMemory = list[FeatureMaps]  # the image features of all frames of training c
 
 @dataclass(frozen=True)
 class BevFusionConfig:
-    """The fusion of the window's BEV maps.
+    """The fusion of the window's BEV maps."""
 
-    Attributes:
-        blocks: number of residual blocks.
-        width: channels of the blocks. Where the concatenated maps have another number of channels, the first block's
-            shortcut is a convolution.
-    """
-
-    blocks: int = 3
+    blocks: int = 3  # number of residual blocks
+    # channels of the blocks. Where the concatenated maps have another number of channels, the first block's shortcut is
+    # a convolution
     width: int = 512
 
     def __post_init__(self) -> None:
@@ -43,21 +39,18 @@ class BevFusionConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BEVFormerV2Config(ModelConfig):
-    """A whole BEVFormerV2. The neck may have more levels than there are level embeddings: those are for training only.
-
-    Attributes:
-        frames: the frames of the window, relative to the current one, in the order of fusion: [-1, 0] is the previous
-            frame and the current one. Positive numbers are later frames (offline use).
-        fusion: fuses the BEV maps of the window; unused where the window has only one frame.
-        ego_motion: switched off; the poses enter by the projections of the window's frames.
-    """
+    """A whole BEVFormerV2. Levels of the neck beyond the level embeddings are for training only."""
 
     architecture: ClassVar[str] = "BEVFormerV2"
     trains_with_gaps: ClassVar[bool] = False
     trains_with_more_levels: ClassVar[bool] = True
 
+    # the frames of the window, relative to the current one, in the order of fusion: [-1, 0] is the previous frame and
+    # the current one. Positive numbers are later frames (offline use)
     frames: tuple[int, ...]
+    # fuses the BEV maps of the window; unused where the window has only one frame
     fusion: BevFusionConfig = field(default_factory=BevFusionConfig)
+    # switched off; the poses enter by the projections of the window's frames
     ego_motion: EgoMotionConfig = NO_EGO_MOTION
 
     def __post_init__(self) -> None:

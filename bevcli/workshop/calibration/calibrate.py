@@ -293,13 +293,9 @@ def judge(drive: Drive, measurement: Measurement) -> CalibrationResult:
         for camera, pose, estimate in zip(stated_rig.cameras, moved(unknowns.stated, changes), cameras, strict=True)
     )
     rig = replace(stated_rig, cameras=corrected)
-    return CalibrationResult(drive.name, stated_rig, rig, cameras, whole, pairs, drive.facts, _even_interval_ms(drive))
-
-
-def _even_interval_ms(drive: Drive) -> float | None:
-    """The time from each frame to the next one, if all are the same but for rounding; else None."""
-    steps = np.diff([stamp.timestamp_ns for stamp in drive.stamps]) / 1e6
-    return float(np.median(steps)) if len(steps) and np.ptp(steps) < EVEN_MS else None
+    steps_ms = np.diff([stamp.timestamp_ns for stamp in drive.stamps]) / 1e6
+    interval_ms = float(np.median(steps_ms)) if len(steps_ms) and np.ptp(steps_ms) < EVEN_MS else None
+    return CalibrationResult(drive.name, stated_rig, rig, cameras, whole, pairs, drive.facts, interval_ms)
 
 
 def _estimate(index: int, measurement: Measurement, change: Array, covariance: Array) -> CameraEstimate:
@@ -455,19 +451,15 @@ def sound_steps(drive: Drive) -> Iterator[bool | None]:
     x = np.zeros(len(unknowns.deviations))
     points = consistent(unknowns, matches, x)
     road = road_residuals(views, unknowns, x, FLOWS_PX[-1], np.zeros(unknowns.cameras))
-    if not _most_fit(unknowns, matches, points, road):
+    # Most matches of each pair fit where it turns as stated, and its road where it moves as far.
+    matched, fit, on_road = (
+        np.bincount(unknowns.groups[some.group, 0], minlength=unknowns.pairs) for some in (matches, points, road)
+    )
+    if not ((fit >= MOSTLY * matched) & (on_road >= SURE_POINTS)).all():
         yield False
         return
     terms = _terms(unknowns, (points, depths_of(unknowns, matches), road), x, ROAD_SCALES_PX[-1])
     yield _is_sound(judge(drive, Measurement(views, matches, unknowns, solve(unknowns, terms, x), points, road)))
-
-
-def _most_fit(unknowns: Unknowns, matches: PointMatches, fitting: PointMatches, road: RoadResiduals) -> bool:
-    """True where most matches of each pair fit, so that it turns as stated, and its road, so that it moves as far."""
-    matched, fit, on_road = (
-        np.bincount(unknowns.groups[some.group, 0], minlength=unknowns.pairs) for some in (matches, fitting, road)
-    )
-    return bool(((fit >= MOSTLY * matched) & (on_road >= SURE_POINTS)).all())
 
 
 def _is_sound(result: CalibrationResult) -> bool:

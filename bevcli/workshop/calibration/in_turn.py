@@ -18,7 +18,7 @@ from bevcli.printing import say
 from bevcli.sequences.view import DriveView
 from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibration
 from bevcli.workshop.calibration.calibrate import CalibrationResult, calibration_steps
-from bevcli.workshop.calibration.estimates import RigEstimate, Verdict, change_text
+from bevcli.workshop.calibration.estimates import Verdict, change_text
 from bevcli.workshop.calibration.views import steps_reached
 from bevcli.workshop.odometry.compare import STEPS, chosen_frames, stated_motion_steps, without_consequences
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
@@ -58,7 +58,10 @@ def calibrate_in_turn(drive: Drive, options: CalibrateOptions) -> Iterator[Calib
             break
         yield None
     beside = beside_x_deg(np.stack([motion.ego_motion.pose_at(stamp.timestamp_ns).matrix for stamp in drive.stamps]))
-    whole = _without_scale(result, options)
+    # Height and scale are those that were stated.
+    height_m = float(np.mean([camera.ego_from_camera[2, 3] for camera in result.stated.cameras]))
+    whole = replace(result.whole, scale=0.0, scale_deviation=options.position_m / height_m)
+    whole = replace(whole, height_m=0.0, height_deviation_m=options.position_m)
     yield replace(result, name=drive.name, whole=whole, rounds=rounds, drives_beside_x_deg=beside)
 
 
@@ -88,14 +91,6 @@ def stands_still(before: CameraRig, after: CameraRig) -> bool:
         if angle > STILL_DEG or np.abs(a.ego_from_camera[:3, 3] - b.ego_from_camera[:3, 3]).max() > STILL_M:
             return False
     return True
-
-
-def _without_scale(result: CalibrationResult, options: CalibrateOptions) -> RigEstimate:
-    """What is said about the whole rig, where height and scale are those that were stated."""
-    height = float(np.mean([camera.ego_from_camera[2, 3] for camera in result.stated.cameras]))
-    deviation_m = options.position_m
-    whole = replace(result.whole, scale=0.0, scale_deviation=deviation_m / height)
-    return replace(whole, height_m=0.0, height_deviation_m=deviation_m)
 
 
 def corrected(drive: Drive) -> Drive:

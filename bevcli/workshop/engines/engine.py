@@ -266,32 +266,26 @@ class RoundingOpenVinoEngine(OpenVinoEngine):
             )
 
 
-def import_openvino() -> Any:
-    """The package openvino, without its telemetry.
+@cache
+def _openvino_core() -> Any:
+    """OpenVINO's one core of this process, without telemetry, which is never deleted.
 
     When it is imported for the first time, openvino sends a message to Google Analytics by the package
     openvino_telemetry. Without that package it takes a stub, which sends nothing.
+
+    On a processor with AMX each core sets a stack for signals and, when it is deleted, restores the one before, which
+    another core may have freed. The next Ctrl-C would then end the process with a segmentation fault (2026.4).
     """
     hidden = "openvino_telemetry"
     before = sys.modules.get(hidden)
     sys.modules[hidden] = None  # type: ignore[assignment]  # import then raises ImportError
     try:
-        return importlib.import_module("openvino")
+        return importlib.import_module("openvino").Core()
     finally:
         if before is None:
             del sys.modules[hidden]
         else:
             sys.modules[hidden] = before
-
-
-@cache
-def _openvino_core() -> Any:
-    """OpenVINO's one core of this process, which is never deleted.
-
-    On a processor with AMX each core sets a stack for signals and, when it is deleted, restores the one before, which
-    another core may have freed. The next Ctrl-C would then end the process with a segmentation fault (2026.4).
-    """
-    return import_openvino().Core()
 
 
 def _cannot_load(file: Path, program: str, error: Exception) -> WeightsError:
@@ -373,7 +367,11 @@ class CachedFile:
     @contextmanager
     def written(self) -> Iterator[Path]:
         """A path for the contents of the file, which takes its place after the block. Raises OutputError."""
-        _remove_unused(self.path.parent)
+        for path in self.path.parent.glob("*.onnx") if self.path.parent.is_dir() else ():
+            with suppress(OSError):
+                if time.time() - path.stat().st_mtime > UNUSED_S:
+                    path.unlink()
+                    path.with_suffix(".json").unlink(missing_ok=True)
         with whole_file(self.path, parents=True) as unfinished:
             yield unfinished
 
@@ -400,14 +398,6 @@ def _load(file: CachedFile, engine: type[Engine], stamp: object) -> CachedNetwor
     with suppress(OSError):  # a cache that cannot be written can be read
         os.utime(file.path)
     return CachedNetwork(network, file_facts.calibrated_with)
-
-
-def _remove_unused(folder: Path) -> None:
-    for path in folder.glob("*.onnx") if folder.is_dir() else ():
-        with suppress(OSError):
-            if time.time() - path.stat().st_mtime > UNUSED_S:
-                path.unlink()
-                path.with_suffix(".json").unlink(missing_ok=True)
 
 
 def _options(sized: Model, rig: CameraRig, deformable_convolution: DeformableConvolution) -> OnnxOptions:

@@ -186,22 +186,14 @@ class SlottedSpatialCrossAttention(nn.Module):
             y = points[..., 1] * height + offsets[:, :, None, level, :, 1] - 0.5
             # One row above or below a map is zero, and so is everything beyond.
             y = y.clamp(-1, height) + (hits.camera * (height + 1)).float()[:, None, :, None]
-            tall = tall_map(level_map, height, width)
+            planes = level_map.permute(2, 3, 0, 1).unflatten(-1, (height, width))  # (heads, D, N, height, width)
+            tall = F.pad(planes, (0, 0, 0, 1)).flatten(2, 3)  # (heads, D, N·(height + 1), width)
             grid = torch.stack([2 * x - 1, (2 * y + 1) / tall.shape[2] - 1], dim=-1)
             sampled = F.grid_sample(tall, grid.transpose(0, 1).flatten(2, 3), align_corners=False)
             weight = weights[:, :, None, level] * hits.filled[:, None, :, None]  # (Y·X, heads, K, P)
             summed = summed + (sampled * weight.transpose(0, 1).flatten(2)[:, None]).sum(-1)  # (heads, D, Y·X)
         attended = summed.permute(2, 0, 1).flatten(1)  # (Y·X, C)
         return self.attention.output_projection(attended / hits.cameras_per_cell)[None]
-
-
-def tall_map(values: Tensor, height: int, width: int) -> Tensor:
-    """The maps of all cameras below each other, each followed by a row of zeros.
-
-    values: (N, height·width, heads, D) -> (heads, D, N·(height + 1), width).
-    """
-    planes = values.permute(2, 3, 0, 1).unflatten(-1, (height, width))  # (heads, D, N, height, width)
-    return F.pad(planes, (0, 0, 0, 1)).flatten(2, 3)
 
 
 class DeformConvOperator(nn.Module):
@@ -352,12 +344,6 @@ def _box_ports(config: ModelConfig) -> Iterator[Port]:
     yield Port("classes", (1, count), "(1, K): index into the metadata's classes.", torch.int64)
 
 
-def _image_sizes_port(lead: tuple[int, int]) -> Port:
-    """An input of a model on a detector. lead: 1 and N."""
-    meaning = "(1, N, 2): width and height of each image within its padding, pixels of the resized image."
-    return Port("image_sizes", (*lead, 2), meaning)
-
-
 def _image_box_ports(config: ModelConfig, cameras: int) -> Iterator[Port]:
     """The boxes in the images, of a backbone that is a detector."""
     if config.detector is None:
@@ -410,7 +396,8 @@ class RecurrentForm(ExportForm):
     @property
     def inputs(self) -> tuple[Port, ...]:
         lead = (1, self.cameras)
-        sizes = (_image_sizes_port(lead),) if self.config.image_classes else ()
+        meaning = "(1, N, 2): width and height of each image within its padding, pixels of the resized image."
+        sizes = (Port("image_sizes", (*lead, 2), meaning),) if self.config.image_classes else ()
         return (*camera_ports(self.config, lead), *_history_ports(self.config), *sizes)
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:

@@ -378,17 +378,13 @@ def chosen_frames(drive: Drive, steps: int = STEPS) -> list[int]:
         return indices
     worth = np.zeros(len(indices) - 1)
     if drive.ego_motion is not None:
-        worth = _worth(drive.ego_motion, np.array([times[index] for index in indices]))
+        poses, _ = Poses.of(drive.ego_motion).at(np.array([times[index] for index in indices]))
+        moves = steps_between(poses)
+        turns = np.abs(np.arctan2(moves[:, 1, 0], moves[:, 0, 0]))
+        worth = np.minimum(turns, MOST_TURN) + MOVING * (np.linalg.norm(moves[:, :3, 3], axis=1) > MOVES_M)
     sums = np.convolve(worth, np.ones(steps), mode="valid")
     start = int(sums.argmax()) if np.ptp(sums) > 0 else starts // 2
     return indices[start : start + steps + 1]
-
-
-def _worth(motion: EgoMotion, times_ns: NDArray[np.int64]) -> Array:
-    """(F - 1,) what the steps between frames tell of mistakes."""
-    steps = steps_between(Poses.of(motion).at(times_ns)[0])
-    turns = np.abs(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))
-    return np.minimum(turns, MOST_TURN) + MOVING * (np.linalg.norm(steps[:, :3, 3], axis=1) > MOVES_M)
 
 
 def without_consequences(

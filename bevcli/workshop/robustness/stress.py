@@ -238,7 +238,10 @@ class StressTest:
             pending = [
                 condition for condition in self._conditions if (condition.name, condition.severity) not in finished
             ]
-            done = self._kept_frames(pending) + (len(self._conditions) - len(pending)) * sum(map(_length, self._scenes))
+            lengths = [len(scene.stamps) for scene in self._scenes]
+            done = (len(self._conditions) - len(pending)) * sum(lengths)
+            if pending:  # frames of its first condition may be stored
+                done += sum(n for i, n in enumerate(lengths) if self._boxes_path(pending[0], i).exists())
             yield done
             runner = self._model.runner(StepOptions(track=False, temporal=self._options.temporal))
             try:
@@ -272,11 +275,6 @@ class StressTest:
             "max_range_m": self._range_m,
             "drives": [{"name": s.name, "scene": s.stamps[0].scene, "frames": len(s.stamps)} for s in self._scenes],
         }
-
-    def _kept_frames(self, pending: Sequence[Condition]) -> int:
-        """The number of frames of the first pending condition whose boxes are stored."""
-        kept = [scene for n, scene in enumerate(self._scenes) if pending and self._boxes_path(pending[0], n).exists()]
-        return sum(map(_length, kept))
 
     def _boxes_path(self, condition: Condition, index: int) -> Path:
         name = "-".join(("boxes", condition.name, condition.severity or "0", str(index)))
@@ -313,10 +311,6 @@ class StressTest:
         path = self._folder.path / RESULTS
         self._folder.add(path)
         write_whole(path, (json.dumps(self.results.to_dict(self._against), indent=1) + "\n").encode())
-
-
-def _length(scene: Drive) -> int:
-    return len(scene.stamps)
 
 
 def _calibrated(drive: Drive) -> Drive:
@@ -364,7 +358,12 @@ def stress_table(results: StressResults, against: StressResults | None = None) -
         sum(corruption.group is group for corruption in tested) for group in (Group.ROBOBEV, Group.UNSEEN)
     )
     if published:
-        parts.append(_means(results, published, against))
+        over = f"over {published} of RoboBEV's 8 corruptions"
+        lines = [f"mRR {_percent(results.mean_resilience())} % {over}"]
+        if against is not None:
+            other = against.header.get("model", "?")
+            lines.append(f"mCE {_percent(results.mean_corruption_error(against))} % against {other} {over}")
+        parts.append("\n".join(lines))
     if unseen:
         mean = _percent(results.mean_resilience(Group.UNSEEN))
         parts.append(f"mean resilience {mean} % over {unseen} of 5 corruptions that no training of bevcli uses")
@@ -387,15 +386,6 @@ def _block(
         rates += [_percent(results.corruption_error(corruption.name, against))] if against else []
         rows.append((corruption.name, *cells, *rates))
     return aligned(rows)
-
-
-def _means(results: StressResults, published: int, against: StressResults | None) -> str:
-    what = f"over {published} of RoboBEV's 8 corruptions"
-    lines = [f"mRR {_percent(results.mean_resilience())} % {what}"]
-    if against is not None:
-        other = against.header.get("model", "?")
-        lines.append(f"mCE {_percent(results.mean_corruption_error(against))} % against {other} {what}")
-    return "\n".join(lines)
 
 
 def _percent(value: float) -> str:

@@ -74,16 +74,13 @@ _ERRORS = {
 
 @dataclass(frozen=True)
 class ClassTracking:
-    """The tracking metrics of one class.
+    """The tracking metrics of one class."""
 
-    Attributes:
-        metrics: name -> value, see METRICS; all but amota and amotp at the threshold with the highest MOTA. NaN where a
-            metric is not defined.
-        levels: name -> (K,) values at the K recall levels, level 1 first: the metrics at one threshold, "confidence"
-            (the threshold) and "recall_hypo" (the level). NaN where a level is not reached.
-    """
-
+    # name -> value, see METRICS; all but amota and amotp at the threshold with the highest MOTA. NaN where a metric is
+    # not defined
     metrics: Mapping[str, float]
+    # name -> (K,) values at the K recall levels, level 1 first: the metrics at one threshold, "confidence" (the
+    # threshold) and "recall_hypo" (the level). NaN where a level is not reached
     levels: Mapping[str, Array]
 
     @property

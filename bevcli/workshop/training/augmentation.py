@@ -53,39 +53,30 @@ class RandomisationConfig:
 
 @dataclass(frozen=True)
 class AugmentationConfig:
-    """The [training.augmentation] table.
+    """The [training.augmentation] table."""
 
-    Attributes:
-        photometric: probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue.
-        grid_mask: probability (0 to 1) that a grid of grey squares covers an image.
-        exposure: largest change of the exposure of a camera, in stops (factors of 2); constant over a clip.
-        white_balance: largest relative change of a camera's red and blue; constant over a clip.
-        noise: largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise.
-        drop_image: probability (0 to 1) that an image is missing. A frame keeps at least one image.
-        calibration_share: probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip.
-        calibration_noise: largest level of that noise (`camera_pose_noise`), drawn uniformly from 0.
-        tilted_share: probability (0 to 1) that the vehicle of a clip pitches and rolls, which its poses do not state.
-        tilt_deg: largest standard deviation of that pitch, drawn uniformly from 0; of the roll half as much. Half of
-            its variance is of the whole clip, as on a slope; each frame draws the rest anew.
-        corrupted_share: probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness,
-            motion blur or few colours, of any severity.
-        lost_cameras_share: probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or
-            black images.
-        randomisation: of the images that enter the network.
-    """
-
+    # probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue
     photometric: float = 0.5
-    grid_mask: float = 0.7
-    exposure: float = 0.0
-    white_balance: float = 0.0
+    grid_mask: float = 0.7  # probability (0 to 1) that a grid of grey squares covers an image
+    exposure: float = 0.0  # largest change of the exposure of a camera, in stops (factors of 2); constant over a clip
+    white_balance: float = 0.0  # largest relative change of a camera's red and blue; constant over a clip
+    # largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise
     noise: float = 0.0
-    drop_image: float = 0.0
+    drop_image: float = 0.0  # probability (0 to 1) that an image is missing. A frame keeps at least one image
+    # probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip
     calibration_share: float = 0.0
-    calibration_noise: float = 4.0
+    calibration_noise: float = 4.0  # largest level of that noise (`camera_pose_noise`), drawn uniformly from 0
+    # probability (0 to 1) that the vehicle of a clip pitches and rolls, which its poses do not state
     tilted_share: float = 0.0
+    # largest standard deviation of that pitch, drawn uniformly from 0; of the roll half as much. Half of its variance
+    # is of the whole clip, as on a slope; each frame draws the rest anew
     tilt_deg: float = 1.5
+    # probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness, motion blur or few
+    # colours, of any severity
     corrupted_share: float = 0.0
+    # probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or black images
     lost_cameras_share: float = 0.0
+    # of the images that enter the network
     randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
 
     def __post_init__(self) -> None:

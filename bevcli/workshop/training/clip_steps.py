@@ -97,20 +97,15 @@ class FrozenStages:
 
 @dataclass(frozen=True)
 class DistillationLossConfig:
-    """The [training.distillation_loss] table.
+    """The [training.distillation_loss] table."""
 
-    Attributes:
-        weight: of the mean squared difference of the BEV maps; 0 disables this part.
-        feature_weight: of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0
-            disables this part. With it the teacher sees the images that the model sees, with all augmentation.
-        teacher: weights of the teacher, a file or a model's name.
-        model: name or TOML file of the teacher's model, which may have another backbone and normalisation of images;
-            "" for the model that is trained.
-    """
-
-    weight: float = 0.0
+    weight: float = 0.0  # of the mean squared difference of the BEV maps; 0 disables this part
+    # of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0 disables this
+    # part. With it the teacher sees the images that the model sees, with all augmentation
     feature_weight: float = 0.0
-    teacher: str = ""
+    teacher: str = ""  # weights of the teacher, a file or a model's name
+    # name or TOML file of the teacher's model, which may have another backbone and normalisation of images; "" for the
+    # model that is trained
     model: str = ""
 
     def __post_init__(self) -> None:

@@ -59,21 +59,15 @@ class ImageObjects:
 
 @dataclass(frozen=True)
 class PerspectiveTargets:
-    """Targets of the S locations of P images. A location that is neither positive nor ignored is background.
+    """Targets of the S locations of P images. A location that is neither positive nor ignored is background."""
 
-    Attributes:
-        positive: (P, S) bool, the locations that detect a box.
-        labels: (P, S) int64, classes of their boxes.
-        boxes: (P, S, 8) box numbers: offset from the location to the projected centre (x, y) in strides; log of the
-            depth in metres times stride divided by focal length; log length, width, height in metres; sine and cosine
-            of the heading relative to the viewing ray. Only those of positive locations are valid.
-        ignored: (P, S) bool, the locations that are neither positive nor background.
-    """
-
-    positive: Tensor
-    labels: Tensor
+    positive: Tensor  # (P, S) bool, the locations that detect a box
+    labels: Tensor  # (P, S) int64, classes of their boxes
+    # (P, S, 8) box numbers: offset from the location to the projected centre (x, y) in strides; log of the depth in
+    # metres times stride divided by focal length; log length, width, height in metres; sine and cosine of the heading
+    # relative to the viewing ray. Only those of positive locations are valid
     boxes: Tensor
-    ignored: Tensor
+    ignored: Tensor  # (P, S) bool, the locations that are neither positive nor background
 
 
 @lru_cache(32)
@@ -324,20 +318,16 @@ def perspective_loss(
 
 @dataclass(frozen=True)
 class LossConfigs:
-    """The tables of [training] whose names end in _loss.
+    """The tables of [training] whose names end in _loss."""
 
-    Attributes:
-        detection_loss: the detection head's.
-        segmentation_loss: the segmentation head's, where the model has one.
-        dense_loss: auxiliary, on the BEV map.
-        perspective_loss: auxiliary, on the image features.
-        distillation_loss: auxiliary, against the BEV map or the image features of a teacher.
-    """
-
+    # the detection head's
     detection_loss: losses.DetectionLossConfig = field(default_factory=losses.DetectionLossConfig)
+    # the segmentation head's, where the model has one
     segmentation_loss: losses.SegmentationLossConfig = field(default_factory=losses.SegmentationLossConfig)
-    dense_loss: losses.DenseLossConfig = field(default_factory=losses.DenseLossConfig)
+    dense_loss: losses.DenseLossConfig = field(default_factory=losses.DenseLossConfig)  # auxiliary, on the BEV map
+    # auxiliary, on the image features
     perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)
+    # auxiliary, against the BEV map or the image features of a teacher
     distillation_loss: DistillationLossConfig = field(default_factory=DistillationLossConfig)
 
 

@@ -71,22 +71,16 @@ MIN_MOVING_MPS = 0.5  # slower objects count as stationary
 
 @dataclass(frozen=True)
 class DetectionLossConfig:
-    """Weights of the detection loss. The class and box weights apply to the matching costs too.
+    """Weights of the detection loss. The class and box weights apply to the matching costs too."""
 
-    Attributes:
-        class_weight: of the focal loss of the classes.
-        box_weight: of the L1 loss of the box codes.
-        velocity_weight: of vx and vy within the L1 loss.
-        moving_weight: additional factor on the velocity of moving objects (0.5 m/s or faster). If most objects are
-            stationary, L1 alone is smallest for a model that predicts zero velocity everywhere.
-        quality_m: with a positive value, the class target of a query with an object is exp(-d / quality_m) instead of
-            1, d metres from the predicted to the true centre on the ground, so that scores rank boxes by their place.
-    """
-
-    class_weight: float = 2.0
-    box_weight: float = 0.25
-    velocity_weight: float = 0.2
+    class_weight: float = 2.0  # of the focal loss of the classes
+    box_weight: float = 0.25  # of the L1 loss of the box codes
+    velocity_weight: float = 0.2  # of vx and vy within the L1 loss
+    # additional factor on the velocity of moving objects (0.5 m/s or faster). If most objects are stationary, L1 alone
+    # is smallest for a model that predicts zero velocity everywhere
     moving_weight: float = 1.0
+    # with a positive value, the class target of a query with an object is exp(-d / quality_m) instead of 1, d metres
+    # from the predicted to the true centre on the ground, so that scores rank boxes by their place
     quality_m: float = 0.0
 
     def __post_init__(self) -> None:

@@ -57,22 +57,17 @@ FREE_CLIPS = 64  # for so many, that folder has to have space
 
 @dataclass(frozen=True)
 class ClipConfig:
-    """The [training.clips] table.
+    """The [training.clips] table."""
 
-    Attributes:
-        frames: frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history.
-        batch: clips of a batch.
-        short_share: share of the batches with shorter clips (0 to 1), because each scene starts without history.
-        learn: "last" trains on the last frame of a clip, as published. "all" trains on every frame of successive
-            frames, with one update each; a clip's first frame has no history.
-        in_turn: with "all", the number of batches a step. The updates alternate between them, so that successive
-            updates do not see the same few streets.
-    """
-
-    frames: int = 3
-    batch: int = 4
+    frames: int = 3  # frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history
+    batch: int = 4  # clips of a batch
+    # share of the batches with shorter clips (0 to 1), because each scene starts without history
     short_share: float = 0.1
+    # "last" trains on the last frame of a clip, as published. "all" trains on every frame of successive frames, with
+    # one update each; a clip's first frame has no history
     learn: Literal["last", "all"] = "last"
+    # with "all", the number of batches a step. The updates alternate between them, so that successive updates do not
+    # see the same few streets
     in_turn: int = 1
 
     def __post_init__(self) -> None:
@@ -155,20 +150,15 @@ def draw_frames(sequence: Drive, count: int, random: np.random.Generator, *, wit
 
 @dataclass(frozen=True)
 class Batch:
-    """B clips of the same length.
+    """B clips of the same length."""
 
-    Attributes:
-        inputs: the network inputs, one a frame of the clips, each for B clips; images may be in bytes.
-        world_from_bev: (frames, B, 4, 4) float64, the poses of the bev frames, metres.
-        targets: of the last frames of the clips. There are fewer than inputs if the first frames are history only.
-        plain: the same clips before augmentation, for a teacher; None without one.
-        distortions: (B, N, 4) float32 of each input: photometric ones of images in bytes; () where they are distorted.
-    """
-
+    # the network inputs, one a frame of the clips, each for B clips; images may be in bytes
     inputs: tuple[ModelInputs, ...]
-    world_from_bev: Tensor
+    world_from_bev: Tensor  # (frames, B, 4, 4) float64, the poses of the bev frames, metres
+    # of the last frames of the clips. There are fewer than inputs if the first frames are history only
     targets: tuple[Targets, ...]
-    plain: "Batch | None" = None
+    plain: "Batch | None" = None  # the same clips before augmentation, for a teacher; None without one
+    # (B, N, 4) float32 of each input: photometric ones of images in bytes; () where they are distorted
     distortions: tuple[Tensor, ...] = ()
 
     def to(self, device: torch.device) -> "Batch":

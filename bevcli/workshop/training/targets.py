@@ -220,17 +220,11 @@ def _locations(vehicles: Boxes3D, grid: BevGrid) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Targets:
-    """The targets of B frames, one of each clip.
+    """The targets of B frames, one of each clip."""
 
-    Attributes:
-        detection: B, the boxes inside the BEV grid.
-        perspective: B, all boxes, for the perspective loss.
-        segmentation: B, or None if the model has no segmentation head.
-    """
-
-    detection: PaddedTargets
-    perspective: PaddedTargets
-    segmentation: PaddedMasks | None
+    detection: PaddedTargets  # B, the boxes inside the BEV grid
+    perspective: PaddedTargets  # B, all boxes, for the perspective loss
+    segmentation: PaddedMasks | None  # B, or None if the model has no segmentation head
 
     def to(self, device: torch.device) -> "Targets":
         """A copy on a device."""

@@ -350,9 +350,9 @@ def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str
     axes.grid(alpha=0.3)
 
 
-def _smoothed(rows: list[Row], points: int = 200) -> list[Row]:
-    """Means over blocks of equal length, at least `points` blocks if there are so many rows."""
-    size = max(1, len(rows) // points)
+def _smoothed(rows: list[Row]) -> list[Row]:
+    """Means over blocks of equal length, at least 200 blocks if there are so many rows."""
+    size = max(1, len(rows) // 200)
     blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
     return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
 
