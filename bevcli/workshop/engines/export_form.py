@@ -78,8 +78,16 @@ class ExportedStep(nn.Module):
     def outputs(self, outputs: ModelOutputs, most_cameras: Tensor) -> tuple[Tensor, ...]:
         """The outputs in the order of `ExportForm.outputs`. most_cameras: (1,), see `SlottedHits`."""
         named = outputs.by_name
-        boxes = decode_boxes(named["class_logits"], named["box_codes"], self.config) if self.decode else ()
-        return (*with_most_cameras(tuple(named.values()), most_cameras), *boxes)
+        listed = with_most_cameras(tuple(named.values()), most_cameras)
+        if not self.decode:
+            return listed
+        best = best_boxes(named["class_logits"], named["box_codes"], self.config.decoder)  # as `ModelOutputs.boxes`
+        x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
+        # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
+        yaw = torch.atan2(-cos, -sin)
+        sizes = [log.exp() for log in (log_length, log_width, log_height)]
+        boxes = torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1)  # (1, K, 9)
+        return (*listed, boxes, best.scores, best.label)
 
 
 def with_most_cameras(outputs: Sequence[Output], most_cameras: Output) -> tuple[Output, ...]:
@@ -129,20 +137,6 @@ class RecurrentStep(ExportedStep):
         outputs = network.detect_with_images(bev, boxes, image_from_bev, image_from_level, image_sizes)
         boxes = outputs.image_boxes
         return (*self.outputs(outputs, hits.most_cameras), *(boxes.by_name.values() if boxes else ()))
-
-
-def decode_boxes(class_logits: Tensor, box_codes: Tensor, config: ModelConfig) -> tuple[Tensor, Tensor, Tensor]:
-    """`ModelOutputs.boxes` for a batch of one, in the graph.
-
-    class_logits: (1, Q, classes). box_codes: (1, Q, 10). Returns boxes (1, K, 9): centre x, y, z and length, width,
-    height in metres, yaw in radians, velocity x, y in m/s, all in the bev frame; falling scores (1, K); classes (1, K).
-    """
-    best = best_boxes(class_logits, box_codes, config.decoder)
-    x, y, log_width, log_length, z, log_height, sin, cos, *velocity = best.codes.unbind(-1)
-    # The code's angle a is clockwise from -y: yaw = -a - pi / 2, whose sine is -cos a and whose cosine is -sin a.
-    yaw = torch.atan2(-cos, -sin)
-    sizes = [log.exp() for log in (log_length, log_width, log_height)]
-    return torch.stack([x, y, z, *sizes, yaw, *velocity], dim=-1), best.scores, best.label
 
 
 DeformableConvolution = Literal["operator", "gridsample"]

@@ -11,9 +11,8 @@ import msgspec
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Drive
-from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import DetectionConfig
-from bevcli.geometry.transforms import inverse
 from bevcli.inference.load import Model
 from bevcli.inference.options import StepOptions
 from bevcli.inference.runner import Runner
@@ -28,7 +27,7 @@ from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness import StressOptions
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
 from bevcli.workshop.scores.detection import evaluate_detections, known_mean
-from bevcli.workshop.scores.evaluate import finite
+from bevcli.workshop.scores.evaluate import boxes_ego, finite
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames, RenderedDrives
 from bevcli.writing import write_whole
@@ -290,9 +289,7 @@ class StressTest:
             drive = _calibrated(changed) if options.calibrate else changed
             for frame, prediction, _ in runner.run(drive):
                 if frame.ground_truth is not None:
-                    predicted = prediction.boxes_ego  # the model has no attributes: they follow from the speed
-                    predicted = replace(predicted, attributes=attributes_by_speed(predicted, self._metrics.classes))
-                    boxes.append((predicted, frame.ground_truth.transformed(inverse(frame.world_from_ego.matrix))))
+                    boxes.append(boxes_ego(frame, frame.ground_truth, prediction, self._metrics.classes))
                 yield
         if not boxes:
             raise InputError(f"{scene.name}: has no ground truth (expected boxes to score against)")

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.frame import MAP_CLASSES, BevMap
+from bevcli.frame import MAP_CLASSES, BevMap, Frame, Prediction
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
 from bevcli.geometry.matching import ERRORS, DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
+from bevcli.geometry.transforms import inverse
 from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.sequences.nuscenes import NuScenesOptions
@@ -225,6 +226,15 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
     if impossible := truth.impossible_boxes:
         notes = (*notes, f"{counted(impossible, 'boxes')} of the ground truth {IMPOSSIBLE}")
     return replace(scores, notes=notes)
+
+
+def boxes_ego(
+    frame: Frame, ground_truth: Boxes3D, prediction: Prediction, classes: Mapping[str, ObjectClass]
+) -> tuple[Boxes3D, Boxes3D]:
+    """Predicted and ground truth boxes in the ego frame. The model has no attributes: they follow from the speed."""
+    predicted = prediction.boxes_ego
+    predicted = replace(predicted, attributes=attributes_by_speed(predicted, classes))
+    return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
 def _range_notes(max_range: float | None, model_range: float | None, pairs: inputs.FramePairs) -> Iterator[str]:

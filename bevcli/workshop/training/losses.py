@@ -105,23 +105,13 @@ def detection_loss(
     truth = padded(targets)
     # (L, B, groups · Q, ...) -> (L · groups, B, Q, ...)
     logits, codes = (x.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1) for x in (class_logits, box_codes))
-    objects, _ = hungarian_matchings(matching_costs(logits, codes, truth, config), truth.counts)
+    with torch.no_grad():  # (..., B, Q, G) focal cost plus L1 distance of the box codes without velocity
+        labels = truth.labels[:, None].expand(*logits.shape[:-1], -1)
+        distances = torch.cdist(codes[..., :VELOCITY_START], truth.codes[..., :VELOCITY_START], p=1)
+        costs = config.class_weight * focal_cost(logits).gather(-1, labels) + config.box_weight * distances
+    objects, _ = hungarian_matchings(costs, truth.counts)
     classes, boxes = assigned_loss(logits, codes, truth, objects, config).sum(0) / groups
     return {"classes": classes, "boxes": boxes}
-
-
-def matching_costs(
-    class_logits: Tensor, box_codes: Tensor, truth: PaddedTargets, config: DetectionLossConfig
-) -> Tensor:
-    """(..., B, Q, G) focal cost plus L1 distance of the box codes without velocity. No gradient.
-
-    class_logits: (..., B, Q, classes). box_codes: (..., B, Q, 10). truth: of B frames.
-    """
-    with torch.no_grad():
-        labels = truth.labels[:, None].expand(*class_logits.shape[:-1], -1)
-        classes = focal_cost(class_logits).gather(-1, labels)
-        boxes = torch.cdist(box_codes[..., :VELOCITY_START], truth.codes[..., :VELOCITY_START], p=1)
-        return config.class_weight * classes + config.box_weight * boxes
 
 
 def assigned_loss(

@@ -20,10 +20,9 @@ from matplotlib.figure import Figure
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import MAP_CLASSES, Drive, Frame, Prediction
-from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import DetectionConfig
-from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
-from bevcli.geometry.transforms import inverse
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import MIB, read_text
@@ -31,7 +30,7 @@ from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.view import count_labels, scenes_of
 from bevcli.workshop.scores.detection import evaluate_detections
-from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation, finite
+from bevcli.workshop.scores.evaluate import FrameScores, boxes_ego, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs
 from bevcli.workshop.scores.tracking import score_tracks
 from bevcli.workshop.synth import DriveOptions
@@ -271,15 +270,6 @@ def drives_table(drives: Sequence[DriveScores]) -> str:
     if scored:
         lines.append(f"mAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}")
     return "\n".join(lines)
-
-
-def boxes_ego(
-    frame: Frame, ground_truth: Boxes3D, prediction: Prediction, classes: Mapping[str, ObjectClass]
-) -> tuple[Boxes3D, Boxes3D]:
-    """Predicted and ground truth boxes in the ego frame. The model has no attributes: they follow from the speed."""
-    predicted = prediction.boxes_ego
-    predicted = replace(predicted, attributes=attributes_by_speed(predicted, classes))
-    return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
 
 
 def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
