@@ -17,6 +17,8 @@ from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
+from bevcli.workshop.training.augmentation import AugmentationConfig
+from bevcli.workshop.training.samples import Batch, BatchMaker, Clip, ClipConfig, joined
 
 COLORS = {"car": (40, 60, 220), "pedestrian": (60, 200, 60)}
 SIZES = {"car": (4.5, 2.0, 1.6), "pedestrian": (0.8, 0.8, 1.8)}
@@ -113,3 +115,20 @@ def _map() -> BevMap:
     cells = np.zeros((64, 64), dtype=np.uint8)
     cells[:, 24:40] = 1
     return BevMap(cells, (-REACH_M, REACH_M), (-REACH_M, REACH_M))
+
+
+def batch_of(
+    drives: PaintedDrives,
+    clips: list[Clip],
+    config: ModelConfig = CONFIG,
+    augmentation: AugmentationConfig = AugmentationConfig(0, 0),
+    seed: int = 0,
+    *,
+    learn_all: bool = False,
+    plain: bool = False,
+) -> Batch:
+    """A batch of these clips, as a training makes it of clips that it draws."""
+    settings = ClipConfig(learn="all" if learn_all else "last")
+    maker = BatchMaker(drives, config, settings, augmentation, 0, 0, with_gap=False, plain=plain, in_bytes=False)
+    random = np.random.default_rng(seed)
+    return joined([maker.load(clip, random) for clip in clips])

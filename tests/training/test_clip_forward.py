@@ -3,10 +3,9 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from painted_drives import CONFIG, PaintedDrives
+from painted_drives import CONFIG, PaintedDrives, batch_of
 
 from bevcli.config import TRAINING, known_models, load_config, load_table
 from bevcli.errors import ConfigError
@@ -22,7 +21,7 @@ from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, ProcessGroup, TrainingConfig, TrainingJob, prepare_training
-from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
+from bevcli.workshop.training.samples import Batch, Clip, ClipConfig
 from bevcli.workshop.training.trainer import Trainer
 
 V1 = replace(CONFIG, heads=("detection",))
@@ -35,11 +34,11 @@ WINDOW = BEVFormerV2Config(
 CPU = torch.device("cpu")
 
 
-def batch_of(config: BEVFormerV2Config, frames: int = 2) -> Batch:
+def clips_of(config: BEVFormerV2Config, frames: int = 2) -> Batch:
     """Clips of three drives, which is not the number of cameras."""
     clips = [Clip(drive, tuple(range(2 - frames, 2))) for drive in range(3)]
     drives = PaintedDrives(3, all_labelled=True)
-    return load_batch(drives, clips, config, AugmentationConfig(0, 0), np.random.default_rng(0), learn_all=True)
+    return batch_of(drives, clips, config, learn_all=True)
 
 
 @pytest.mark.parametrize("config", [V1, WINDOW], ids=["BEVFormer", "BEVFormerV2"])
@@ -48,7 +47,7 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
     """With batch norms in evaluation mode, and without dropout."""
     torch.manual_seed(0)
     model = build_model(config).eval()
-    outputs = list(forward_clip(model, batch_of(config), learn_all=learn_all, freeze_batch_norm=True))
+    outputs = list(forward_clip(model, clips_of(config), learn_all=learn_all, freeze_batch_norm=True))
     assert len(outputs) == (2 if learn_all else 1)
     model.eval()
     drives = PaintedDrives(3, all_labelled=True)
@@ -68,7 +67,7 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
 
 def test_the_earlier_frame_of_a_window_counts_without_gradient() -> None:
     torch.manual_seed(0)
-    model, batch = build_model(WINDOW), batch_of(WINDOW)
+    model, batch = build_model(WINDOW), clips_of(WINDOW)
     black = replace(batch.inputs[0], images=torch.zeros_like(batch.inputs[0].images))
     moved = batch.world_from_bev.clone()
     moved[0, :, 0, 3] += 5

@@ -4,10 +4,9 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from painted_drives import CONFIG, PaintedDrives
+from painted_drives import CONFIG, PaintedDrives, batch_of
 
 from bevcli.checkpoints import load_weights
 from bevcli.config import as_table, as_toml as toml_of, load_config
@@ -18,7 +17,7 @@ from bevcli.model.network import build_network
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.clip_steps import DistillationLossConfig, Teacher, forward_clip
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob
-from bevcli.workshop.training.samples import Batch, Clip, ClipConfig, load_batch
+from bevcli.workshop.training.samples import Batch, Clip, ClipConfig
 from bevcli.workshop.training.trainer import Trainer, save_weights
 
 NOISE = AugmentationConfig(photometric=0, grid_mask=0, noise=60.0)
@@ -41,7 +40,7 @@ def weights(model: BEVFormer, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def clips(augmentation: AugmentationConfig) -> Batch:
     drives = PaintedDrives(2, all_labelled=True)
     both = [Clip(0, (0, 1)), Clip(1, (0, 1))]
-    return load_batch(drives, both, CONFIG, augmentation, np.random.default_rng(1), learn_all=True, plain=True)
+    return batch_of(drives, both, CONFIG, augmentation, 1, learn_all=True, plain=True)
 
 
 def test_a_teacher_sees_the_clips_before_augmentation() -> None:

@@ -3,11 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from one_image import targets_of_image
-from painted_drives import CONFIG, PaintedDrives
+from painted_drives import CONFIG, PaintedDrives, batch_of
 
 from bevcli.config import TRAINING, load_table
 from bevcli.errors import ConfigError
@@ -15,7 +14,6 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig
-from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.frame_losses import (
     FrameLosses,
     PerspectiveHead,
@@ -24,7 +22,7 @@ from bevcli.workshop.training.frame_losses import (
     perspective_loss,
 )
 from bevcli.workshop.training.job import TrainingConfig
-from bevcli.workshop.training.samples import Batch, Clip, load_batch
+from bevcli.workshop.training.samples import Batch, Clip
 from bevcli.workshop.training.targets import DetectionTargets
 
 WEIGHTS = PerspectiveLossConfig(weight=1.0)
@@ -42,7 +40,7 @@ TWO_LEVELS = replace(
 def batch(frames: int = 2) -> Batch:
     """The second frame of painted drives."""
     clips = [Clip(drive, (1,)) for drive in range(frames)]
-    return load_batch(PaintedDrives(frames), clips, TWO_LEVELS, AugmentationConfig(0, 0), np.random.default_rng(0))
+    return batch_of(PaintedDrives(frames), clips, TWO_LEVELS)
 
 
 def make_head(layers: int = 1) -> PerspectiveHead:
@@ -212,7 +210,7 @@ def test_each_weight_scales_its_part() -> None:
 def test_boxes_outside_the_grid_are_detected_too() -> None:
     """The grid ends at 16 m; the camera sees further."""
     config = replace(TWO_LEVELS, bev_grid=replace(TWO_LEVELS.bev_grid, y_range_m=(-6, 6)))
-    data = load_batch(PaintedDrives(1), [Clip(0, (1,))], config, AugmentationConfig(0, 0), np.random.default_rng(0))
+    data = batch_of(PaintedDrives(1), [Clip(0, (1,))], config)
     targets = data.targets[0]
     assert len(targets.detection[0].labels) < len(targets.perspective[0].labels) == 5
 

@@ -186,49 +186,6 @@ class Batch:
         return replace(self, inputs=inputs, plain=plain, distortions=())
 
 
-def load_batch(
-    drives: Drives,
-    clips: list[Clip],
-    config: ModelConfig,
-    augmentation: AugmentationConfig,
-    random: np.random.Generator,
-    *,
-    learn_all: bool = False,
-    plain: bool = False,
-    in_bytes: bool = False,
-) -> Batch:
-    """Reads, augments and preprocesses the frames of clips of the same length.
-
-    Args:
-        learn_all: give targets for every frame, not for the last one only.
-        plain: give the clips before augmentation too.
-        in_bytes: give images as bytes, see `write_bytes`.
-
-    Raises InputError where a frame to train on has no ground truth.
-    """
-
-    def load_clip(clip: Clip) -> Batch:
-        drive = drives.open(clip.drive)
-        loaded = [drive.load(index) for index in clip.frames]
-        shown, drawn = augmented(loaded, augmentation, random)
-        prepared = _prepared(shown if in_bytes else [*map(distorted, shown, drawn)], config, in_bytes)
-        inputs = _inputs(prepared, config)
-        for step in inputs:
-            mask_images(step.images, augmentation.grid_mask, random)
-        poses = [[x.frame.world_from_ego.matrix @ x.frame.rig.ego_from_bev] for x in prepared]
-        world_from_bev = torch.from_numpy(np.array(poses))
-        targets = tuple(frame_targets(x.frame, config) for x in prepared[0 if learn_all else -1 :])
-        before = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if plain else None
-        distortions = tuple(
-            torch.tensor([[changes.get(name, UNDISTORTED) for name in x.assignment.cameras]])  # (1, N, 4)
-            for x, changes in zip(prepared, drawn, strict=True)
-            if in_bytes and augmentation.photometric
-        )
-        return Batch(inputs, world_from_bev, targets, before, distortions)
-
-    return joined([load_clip(clip) for clip in clips])
-
-
 def joined(batches: Sequence[Batch]) -> Batch:
     """Batches with as many frames and cameras as one batch. Raises InputError where their cameras differ in number."""
     if len(batches) == 1:
@@ -315,10 +272,29 @@ class BatchMaker:
         """The clip at an index (0 to `clips.batch` - 1) of that batch. It depends on no other clip."""
         seed = [self.seed, step, self.rank, turn]
         clip, random = draw_clip(self.drives, self.clips, seed, index, with_gap=self.with_gap)
-        return load_batch(
-            self.drives, [clip], self.model, self.augmentation, random,
-            learn_all=self.clips.learn == "all", plain=self.plain, in_bytes=self.in_bytes,
-        )  # fmt: skip
+        return self.load(clip, random)
+
+    def load(self, clip: Clip, random: np.random.Generator) -> Batch:
+        """The frames of a clip, read, augmented and preprocessed; raises InputError where one has no ground truth."""
+        config, augmentation, in_bytes = self.model, self.augmentation, self.in_bytes
+        drive = self.drives.open(clip.drive)
+        loaded = [drive.load(index) for index in clip.frames]
+        shown, drawn = augmented(loaded, augmentation, random)
+        prepared = _prepared(shown if in_bytes else [*map(distorted, shown, drawn)], config, in_bytes)
+        inputs = _inputs(prepared, config)
+        for step in inputs:
+            mask_images(step.images, augmentation.grid_mask, random)
+        poses = [[x.frame.world_from_ego.matrix @ x.frame.rig.ego_from_bev] for x in prepared]
+        world_from_bev = torch.from_numpy(np.array(poses))
+        learned = prepared if self.clips.learn == "all" else prepared[-1:]
+        targets = tuple(frame_targets(x.frame, config) for x in learned)
+        plain = Batch(_inputs(_prepared(loaded, config, in_bytes), config), world_from_bev, ()) if self.plain else None
+        distortions = tuple(
+            torch.tensor([[changes.get(name, UNDISTORTED) for name in x.assignment.cameras]])  # (1, N, 4)
+            for x, changes in zip(prepared, drawn, strict=True)
+            if in_bytes and augmentation.photometric
+        )
+        return Batch(inputs, world_from_bev, targets, plain, distortions)
 
 
 def loaded_batches(
