@@ -321,7 +321,7 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
     left, right = figure.subplots(1, 2)
     _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
     shown = ("step", "mAP", "NDS")
-    scores = [{k: v for k, v in row.items() if k in shown or k.startswith("IoU")} for row in validation.rows]
+    scores: list[Row] = [{k: v for k, v in row.items() if k in shown or k.startswith("IoU")} for row in validation.rows]
     _draw_rows(right, scores, skipped=("step",), marker="o")
     left.set(title="Training loss", xlabel="step", yscale="log")
     right.set(title="Validation", xlabel="step")
