@@ -44,17 +44,11 @@ COMPARED = ("bev", "class_logits", "box_codes", "mask_logits", "mask_class_logit
 
 
 class LoadedFile(nn.Module):
-    """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's.
+    """An exported file, loaded. A module without parameters, so that its time can be measured like any other part's."""
 
-    Attributes:
-        metadata: of the file: text by name.
-        input_shapes: name of each input -> its shape.
-        outputs: names of the outputs.
-    """
-
-    metadata: Mapping[str, str]
-    input_shapes: Mapping[str, tuple[int, ...]]
-    outputs: tuple[str, ...]
+    metadata: Mapping[str, str]  # of the file: text by name
+    input_shapes: Mapping[str, tuple[int, ...]]  # name of each input -> its shape
+    outputs: tuple[str, ...]  # names of the outputs
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
         """One step. feed: every input by name. Returns every output by name."""

@@ -24,24 +24,15 @@ from bevcli.workshop.scores.tables import Cell, Table
 
 @dataclass(frozen=True)
 class TrackingConfig(ClassRanges):
-    """All parameters of the tracking metrics; the defaults are the nuScenes devkit's (tracking_nips_2019).
-
-    Attributes:
-        match_distance_m: centres that are closer on the ground can match.
-        recall_levels: number of recall levels from `min_recall` to 1 over which AMOTA and AMOTP are means.
-        min_recall: the lowest recall level.
-        frame_period_s: duration that one frame counts in tid and lgd, whatever the timestamps are.
-        mostly_tracked, mostly_lost: an object counts as mostly tracked when it is matched in at least, and as mostly
-            lost when it is matched in less than, this share of its frames.
-    """
+    """All parameters of the tracking metrics; the defaults are the nuScenes devkit's (tracking_nips_2019)."""
 
     class_ranges_m: Mapping[str, float] = field(default_factory=lambda: _tracked_ranges_m(NUSCENES_CLASSES))
-    match_distance_m: float = MATCH_DISTANCE_M
-    recall_levels: int = 40
-    min_recall: float = 0.1
-    frame_period_s: float = 0.5
-    mostly_tracked: float = 0.8
-    mostly_lost: float = 0.2
+    match_distance_m: float = MATCH_DISTANCE_M  # centres that are closer on the ground can match
+    recall_levels: int = 40  # number of recall levels from `min_recall` to 1 over which AMOTA and AMOTP are means
+    min_recall: float = 0.1  # the lowest recall level
+    frame_period_s: float = 0.5  # duration that one frame counts in tid and lgd, whatever the timestamps are
+    mostly_tracked: float = 0.8  # of an object that is matched in at least this share of its frames
+    mostly_lost: float = 0.2  # of one that is matched in less than this share
 
     @classmethod
     def of(cls, classes: Mapping[str, ObjectClass]) -> Self:

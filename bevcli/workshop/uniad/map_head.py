@@ -170,15 +170,10 @@ class FlatListAttention(DeformableAttention):
 
 
 class MapEncoder(nn.Module):
-    """Refines the BEV map for the map head. Its result has the shape of the BEV map.
+    """Refines the BEV map for the map head. Its result has the shape of the BEV map."""
 
-    Attributes:
-        position: (Y·X, C) float32, sine position embedding of the cells.
-        cell_centers: (Y·X, 2) float32, x and y of the cells' centres, 0 to 1 over the map.
-    """
-
-    position: Tensor
-    cell_centers: Tensor
+    position: Tensor  # (Y·X, C) float32, sine position embedding of the cells
+    cell_centers: Tensor  # (Y·X, 2) float32, x and y of the cells' centres, 0 to 1 over the map
 
     def __init__(self, config: DecoderConfig, channels: int, grid: BevGrid, attention_levels: int) -> None:
         """Random weights. attention_levels: levels that the attentions are built for, although there is one map."""
