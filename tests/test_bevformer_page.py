@@ -123,11 +123,12 @@ def facts_of(name: str) -> dict[str, str]:
     return facts
 
 
-@pytest.mark.parametrize("model", [pytest.param(name, marks=[pytest.mark.slow] * (name == "base")) for name in MODELS])
+@pytest.mark.parametrize("model", [pytest.param(name, marks=[pytest.mark.slow] * (name != "tiny")) for name in MODELS])
 def test_the_tables_state_the_shapes_and_sizes_of_the_models(model):
     assert {label: stated[model] for label, stated in table_rows(MODELS).items()} == facts_of(model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", V2_MODELS)
 def test_the_table_of_v2_states_shapes_and_sizes_of_its_models(model):
     assert {label: stated[model] for label, stated in table_rows(V2_MODELS).items()} == facts_of_v2(model)

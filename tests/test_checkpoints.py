@@ -83,7 +83,9 @@ def official_v2(model: str, tmp_path: Path, **changes: tuple[int, ...]) -> Path:
     return path
 
 
-@pytest.mark.parametrize("model", V2_MODELS)
+@pytest.mark.parametrize(
+    "model", [pytest.param(name, marks=[pytest.mark.slow] * (name != "v2-t8")) for name in V2_MODELS]
+)
 def test_parts_of_v2_files_for_training_are_named_and_left_out(model: str, tmp_path: Path) -> None:
     summary = read_checkpoint(official_v2(model, tmp_path))
     assert model in summary.models
@@ -103,7 +105,7 @@ def official_uniad(tmp_path: Path, *, version_1_0: bool) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("version_1_0", "left_out"), [(False, 132), (True, 137)])
+@pytest.mark.parametrize(("version_1_0", "left_out"), [(False, 132), pytest.param(True, 137, marks=pytest.mark.slow)])
 def test_keys_of_uniad_files_without_effect_are_left_out(version_1_0: bool, left_out: int, tmp_path: Path) -> None:
     summary = read_checkpoint(official_uniad(tmp_path, version_1_0=version_1_0))
     assert summary.models == ("uniad-track-map",)
@@ -258,6 +260,7 @@ def test_weights_of_another_grid_are_resampled_on_request(tmp_path: Path) -> Non
     torch.testing.assert_close(finer.bev_queries.row_embedding.data[1:-1, 0], ((torch.arange(12) + 0.5) / 12)[1:-1])
 
 
+@pytest.mark.slow
 def test_a_converted_file_holds_the_same_numbers(official_tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "tiny.safetensors"
     summary = convert(official_tiny, out)
@@ -387,6 +390,7 @@ def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> No
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_weights_inspect_needs_a_file_that_fits_the_model(official_tiny: Path) -> None:
     answer = CliRunner().invoke(app, ["weights", "inspect", str(official_tiny), "--model", "base"])
     assert isinstance(answer.exception, WeightsError)

@@ -10,6 +10,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 from runpy import run_path
@@ -53,10 +54,16 @@ def shown_commands(document: Path) -> list[str]:
     return lines + [span for span in code_spans(document) if span == "bevcli" or span.startswith("bevcli ")]
 
 
+@cache
+def commands() -> Any:
+    return typer.main.get_command(app)
+
+
 def option_names(command: Any) -> set[str]:
     return HELP | {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
 
 
+@cache
 def options_of_all_commands(command: Any) -> set[str]:
     names = command.list_commands(None) if hasattr(command, "commands") else ()
     parts = [command.get_command(None, name) for name in names]
@@ -68,7 +75,7 @@ def options_of_all_commands(command: Any) -> set[str]:
 def test_shown_commands_and_options_are_known(document: Path) -> None:
     for line in shown_commands(document):
         words = shlex.split(line, comments=True)[1:]
-        command = typer.main.get_command(app)
+        command = commands()
         while words and hasattr(command, "commands") and not words[0].startswith("-"):
             assert words[0] in command.list_commands(None), line
             command = command.get_command(None, words.pop(0))
@@ -79,7 +86,7 @@ def test_shown_commands_and_options_are_known(document: Path) -> None:
 @each(OF_TODAY)
 def test_options_in_the_prose_are_those_of_some_command(document: Path) -> None:
     mentioned = {name for span in code_spans(document) for name in re.findall(r"^--[\w-]+", span)}
-    unknown = mentioned - options_of_all_commands(typer.main.get_command(app))
+    unknown = mentioned - options_of_all_commands(commands())
     assert not unknown
 
 

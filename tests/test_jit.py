@@ -47,6 +47,7 @@ def start(root: Path, temporary: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_without_a_writable_place_the_cache_is_a_private_folder(read_only, tmp_path):
     (tmp_path / "temporary").mkdir()
     done = start(read_only, tmp_path / "temporary")

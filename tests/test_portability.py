@@ -39,6 +39,7 @@ def test_every_module_is_imported_without_posix() -> None:
 ROOT = Path(bevcli.__file__).parent
 
 
+@pytest.mark.slow
 def test_importing_the_core_loads_no_workshop():
     """Beside its names. `bevcli.calibrate` and `bevcli.render` are texts, imported when they are used."""
     files = [path.relative_to(ROOT).with_suffix("") for path in sorted(ROOT.rglob("*.py"))]

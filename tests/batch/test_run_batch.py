@@ -113,6 +113,7 @@ def test_drives_that_are_not_scored_have_their_agreement(batch, tmp_path, monkey
     assert (row["agreement"], row["agreement_low"], row["agreement_high"]) == (0.5123, 0.4, None)
 
 
+@pytest.mark.slow
 def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
     batch()
     before = times(tmp_path / "out")
@@ -135,6 +136,7 @@ def test_failed_drives_run_again_on_request_or_once_mended(batch, tmp_path):
     assert (summary.skipped, summary.failed) == (1, 0)
 
 
+@pytest.mark.slow
 def test_drives_run_again_if_input_or_option_differs_not_order(batch, tmp_path):
     paths = [str(path) for path in write_fleet(tmp_path / "drives", 3)]
     batch(paths)
@@ -177,6 +179,7 @@ def test_a_wrong_mesh_of_a_class_ends_a_batch_before_it_starts(fleet, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
     stopped = batch(frames=1 + 4 + 2)  # the second drive is stopped after its second frame
     assert stopped.stopped
@@ -256,6 +259,7 @@ def test_urls_are_copied_and_removed_and_results_go_to_urls(batch, fleet, model,
     assert not list((tmp_path / "scratch").iterdir())
 
 
+@pytest.mark.slow
 def test_a_nuscenes_root_at_a_url_gives_the_bytes_of_a_local_one(batch, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
@@ -330,6 +334,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 def test_damaged_records_are_run_again(batch, tmp_path):
     names = [str(tmp_path / "drives" / f"d{number:03d}") for number in range(len(WRONG) + 1)]
     write_fleet(tmp_path / "drives", len(names), 1)
@@ -346,6 +351,7 @@ def test_damaged_records_are_run_again(batch, tmp_path):
         assert all(old[key] == new[key] for key in ("drive", "result", "attempts", "error", "boxes_by_class"))
 
 
+@pytest.mark.slow
 def test_odd_names_of_drives_are_cells_and_no_formulas(batch, tmp_path):
     names = ["+1+1", "-1", "=1+1", "@x", "\udcffx"]
     for seed, name in enumerate(names):

@@ -182,6 +182,7 @@ def test_a_window_is_filled_after_one_frame(window_model, frames, filled):
     assert [frame.stamp.index for frame in version.state.memory.frames] == filled
 
 
+@pytest.mark.slow
 def test_runs_and_the_model_alone_take_turns_without_a_gap(window_model, monkeypatch):
     monkeypatch.setattr(measure, "RUN_FRAMES", 4)
     monkeypatch.setattr(measure, "RUNS", 2)
@@ -210,6 +211,7 @@ def operations_of_tiny() -> float:
     return count_operations(load_config("tiny"), HITS)
 
 
+@pytest.mark.slow
 def test_tiny_needs_slightly_more_operations_than_six_resnet50():
     backbone = 6 * RESNET50_OPERATIONS * (480 * 800) / 224**2
     assert 1.02 * backbone < operations_of_tiny() < 1.12 * backbone

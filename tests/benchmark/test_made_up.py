@@ -1,6 +1,7 @@
 """The benchmark's drive and weights resemble a real drive and a trained model in everything that affects times."""
 
 import numpy as np
+import pytest
 import torch
 
 from bevcli.config import load_config
@@ -9,6 +10,7 @@ from bevcli.model.pillar_projection import find_hits, project_pillars
 from bevcli.workshop.benchmark.versions import MadeUpDrive, made_up_model
 
 
+@pytest.mark.slow
 def test_the_cameras_see_about_as_many_cells_as_nuscenes():
     config = load_config("tiny")
     prepared = Preprocessor(config)(MadeUpDrive(1).load(0))

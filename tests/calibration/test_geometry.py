@@ -262,6 +262,7 @@ def planted():
     return views, unknowns_of(views, CalibrateOptions()), matches_of(right, views, 0.1)
 
 
+@pytest.mark.slow
 def test_neighbours_tell_their_rotation_against_each_other(planted):
     _, unknowns, matches = planted
     within, at_once, depths = matches.where(matches.same), matches.where(~matches.moves), depths_of(unknowns, matches)
@@ -309,6 +310,7 @@ def road_views(ground: np.ndarray, noise: float) -> Views:
     return Views(rig, rig, ((0, 1),), of)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("striped", "least", "most"), [(False, 0.9, 1.1), (True, 0.0, 0.6)])
 def test_a_road_of_stripes_does_not_show_a_wrong_roll(striped, least, most):
     size = (1 if striped else 200, 160)

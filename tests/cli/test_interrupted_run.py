@@ -125,6 +125,7 @@ def test_a_signal_ends_a_run_after_its_frame_resume_completes_it(place):
     assert_equals_whole(out, place)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_with_its_finished_frames(place):
     out = place / "killed"
     run = Run(place, out)

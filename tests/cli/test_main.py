@@ -211,7 +211,7 @@ def test_an_output_name_that_the_system_refuses_is_one_line(arguments, tmp_path)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
-@pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("weights", "inspect", "--model", "demo")])
+@pytest.mark.parametrize("arguments", [("--version",), ("--help",), ("weights", "list")])
 def test_a_full_output_device_is_one_line(arguments, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["bevcli", *arguments])
     with (

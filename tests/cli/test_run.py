@@ -68,6 +68,7 @@ def test_the_command_runs_the_sample_and_says_untrained(tmp_path):
     assert len(read_boxes(out / "predictions.json").frames) == 2
 
 
+@pytest.mark.slow
 def test_some_frames_give_the_same_boxes_as_the_whole(job):
     whole = read_boxes(job(MemoryDrive(4), out="whole") / "predictions.json")
     part = read_boxes(job(MemoryDrive(2), out="part") / "predictions.json")
@@ -76,6 +77,7 @@ def test_some_frames_give_the_same_boxes_as_the_whole(job):
         assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_one_thread_and_two_agree(job):
     threads = torch.get_num_threads()
     try:
@@ -200,6 +202,7 @@ def place(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_commands_end_with_what_they_wrote(place):
     (place / "list.txt").write_text("drives/d001\ndrives/missing\n")
     arguments = ("batch", "drives/d000", "--list", "list.txt", "--out", "out", "--model", "mini.toml", "--untrained")

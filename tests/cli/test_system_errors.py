@@ -64,6 +64,7 @@ def test_a_lack_of_memory_is_one_line(error, tmp_path, monkeypatch):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_package_that_cannot_be_imported_is_one_line(tmp_path):
     environment = {**os.environ, "NUMBA_NUM_THREADS": "0"}
     run = [*PROGRAM, "render", "out", "--count", "1"]

@@ -47,6 +47,7 @@ def test_an_engine_equals_the_model_with_and_without_history(small_file, engine)
     check_file(load_exported(small_file, engine), model_for_engines())
 
 
+@pytest.mark.slow
 def test_ctrl_c_reaches_python_after_openvino_models_are_gone(small_file):
     """On processors with AMX it ended the process with a segmentation fault."""
     models = [load_exported(small_file, "openvino") for _ in range(2)]

@@ -141,6 +141,7 @@ class Rotation(torch.nn.Module):
         return rotate_history(history, rotation_deg, self.grid, self.center)
 
 
+@pytest.mark.slow
 def test_the_history_is_rotated_to_the_same_cells(tmp_path):
     """Each cell takes the nearest old one. OpenVINO rounds otherwise where two are equally near (docs/deploy.md)."""
     config, file = load_config("base"), tmp_path / "rotation.onnx"

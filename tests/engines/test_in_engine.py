@@ -114,6 +114,7 @@ def test_a_session_takes_the_file_and_int8_needs_frames(steps, drive, network):
         Session(chosen(network, "onnxruntime", "int8"), other)
 
 
+@pytest.mark.slow
 def test_a_broken_file_is_made_anew(steps, drive, network):
     model = chosen(network, "onnxruntime")
     file = model.in_engine(drive.rig, drive).file
@@ -133,6 +134,7 @@ def test_a_longer_drive_is_not_run_with_a_file_of_a_short_one(steps, drive, netw
     assert files[0] == files[1] != files[2] == files[3]
 
 
+@pytest.mark.slow
 def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
     both = Barrier(2, timeout=60)
 

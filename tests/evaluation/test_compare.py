@@ -299,6 +299,7 @@ def test_three_files_of_predictions_are_refused(files: tuple[Path, Path, Path]) 
         CliRunner().invoke(app, ["eval", *map(str, (*files[:2], *files[1:]))], catch_exceptions=False)
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, monkeypatch: Any) -> None:
     page = (STREET.parents[1] / "docs" / "compare.md").read_text().partition("## Compare two models")[2]
     (tmp_path / "samples").mkdir()

@@ -154,6 +154,7 @@ def test_only_map_classes_of_both_sides_are_scored(
     assert any(note in text for text in scores["notes"])
 
 
+@pytest.mark.slow
 def test_plots_are_not_empty(tmp_path: Path, files: tuple[Path, Path]) -> None:
     CliRunner().invoke(app, ["eval", *map(str, files), "--plot", str(tmp_path / "plots")], catch_exceptions=False)
     names = {"precision_recall.png", "errors_by_range.png", "misses_and_false_alarms.png"}
@@ -165,6 +166,7 @@ def test_plots_are_not_empty(tmp_path: Path, files: tuple[Path, Path]) -> None:
         assert (image < 200).any(axis=2).mean() > 0.005
 
 
+@pytest.mark.slow
 def test_plots_without_boxes_are_drawn(tmp_path: Path) -> None:
     empty = write_frames(tmp_path / "empty.json", [Boxes3D.empty()], pose=Pose.identity())
     evaluated(empty, empty, "--plot", tmp_path / "plots")

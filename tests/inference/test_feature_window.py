@@ -43,7 +43,7 @@ def test_a_missing_frame_takes_the_nearest_towards_the_current(frames, exists, s
     assert fill_window(frames, exists) == sources
 
 
-@pytest.mark.parametrize("frames", [(0,), (-1, 0), (-3, -2, -1, 0), (-1, 0, 1)])
+@pytest.mark.parametrize("frames", [(-3, -2, -1, 0), (-1, 0, 1)])
 def test_every_frame_passes_the_backbone_once(window_model, frames):
     model, calls = window_model(*frames), []
     with model.backbone.register_forward_hook(lambda module, inputs, output: calls.append(len(inputs[0]))):
@@ -83,7 +83,7 @@ def test_a_run_cut_in_two_equals_the_whole(models):
     sequence = MemoryDrive(5)
     for model in models((-2, -1, 0)):
         whole, _ = run(model, sequence)
-        for cut in (1, 2, 4):
+        for cut in (1, 3):
             first, state = run(model, sequence, range(cut))
             second, _ = run(model, sequence, range(cut, 5), state)
             for one, other in zip(whole, first + second, strict=True):
@@ -102,6 +102,7 @@ def test_an_interrupted_run_that_looks_ahead_goes_on_from_state(window_model):
         assert_same(one, other)
 
 
+@pytest.mark.slow
 def test_a_scene_change_equals_a_fresh_start(models):
     """Inside a window too."""
     sequence = MemoryDrive(5, scenes="aaabb")
@@ -203,6 +204,7 @@ def test_the_bev_frame_moves_with_the_vehicle():
         assert other_bev_from_bev(now, then, ego_from_bev) == pytest.approx(expected, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_with_its_window(window_model, tmp_path):
     model = Model(window_model(-1, 0, 1))
     run_into_folder(model, MemoryDrive(5), tmp_path / "whole")

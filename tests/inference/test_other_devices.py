@@ -127,6 +127,7 @@ def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, 
         assert device.waits == [*slope, "event"]
 
 
+@pytest.mark.slow
 def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
     config = small_version("demo")
     model, prepared = made_up_model(config), frames(config, same_projection=True)
@@ -135,6 +136,7 @@ def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
     assert device.waits == ["event"]
 
 
+@pytest.mark.slow
 def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
     config = small_version("demo")
     model, prepared = made_up_model(config), frames(config, same_projection=True)
@@ -153,6 +155,7 @@ def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
     assert copied == ["bevcli.model.upload.pinned", "bevcli.inference.pipeline.pinned_place"]
 
 
+@pytest.mark.slow
 def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
     config = small_version("demo")
     model, (frame, *_) = made_up_model(config), frames(config)
@@ -335,6 +338,7 @@ def interrupt_and_resume(model, out):
     run_into_folder(model, drive, out, resume=True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked_recordings")
 def test_an_interrupted_overlapped_run_has_all_frames(mini_model, tmp_path, overlapping):
     model = Model(mini_model, tracker=TRACKER)

@@ -198,7 +198,7 @@ def by_opencv(pixels, width, height, method):
     return ((floats - MEAN) / STD).transpose(2, 0, 1)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(lengths, lengths, lengths, lengths, st.sampled_from(sorted(INTERPOLATION)), st.integers(0, 2**31))
 def test_it_equals_opencv_for_any_size(width, height, new_width, new_height, method, seed):
     if method == "area":  # only for shrinking

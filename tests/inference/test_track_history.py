@@ -106,7 +106,7 @@ def test_a_prediction_has_the_map_of_the_models_classes(whole, config):
     assert whole[0].segmentation.cells.shape == (config.bev_grid.rows, config.bev_grid.columns)
 
 
-@pytest.mark.parametrize("cut", [1, 3, 5])
+@pytest.mark.parametrize("cut", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_run_cut_in_two_equals_the_whole(model, whole, cut):
     first, state = run(model, MemoryDrive(6), range(cut))
     second, _ = run(model, MemoryDrive(6), range(cut, 6), state)
@@ -214,6 +214,7 @@ def test_without_history_the_tracker_gives_identities(loaded):
         assert (prediction.boxes.instances != "").all()  # this tracker starts a track from every box
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_resumed_with_its_tracks(loaded, tmp_path):
     options = RunOptions(recording=RecordingOptions(score=0.5))
     drive = MemoryDrive(5, scenes="aaabb")

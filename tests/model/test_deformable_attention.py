@@ -189,7 +189,9 @@ def test_the_gpu_equals_the_cpu(dtype):
     torch.testing.assert_close(found, expected, rtol=2e-2 if dtype != torch.float32 else 1e-4, atol=1e-3)
 
 
-@pytest.mark.parametrize("count", [4, 6, 8, 32])
+@pytest.mark.parametrize(
+    "count", [4, pytest.param(6, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow), 32]
+)
 def test_the_compiled_softmax_equals_that_of_pytorch(count):
     logits = 50 * torch.randn(3 * count, generator=torch.Generator().manual_seed(0))
     logits[0], logits[count] = torch.nan, torch.inf

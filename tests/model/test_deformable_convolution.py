@@ -102,6 +102,7 @@ def test_compiled_equals_plain(monkeypatch, stride, tile_bytes):
     torch.testing.assert_close(fast(x.to(memory_format=torch.channels_last)), plain(x), atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_half_precision_stays_near(dtype):
     plain, x = plain_layer(1), image()

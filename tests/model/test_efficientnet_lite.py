@@ -89,7 +89,7 @@ def test_the_fast_form_gives_the_same_maps(size: tuple[int, int]) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("precision", ["fp32", pytest.param("bf16", marks=pytest.mark.slow)])
 def test_a_prepared_model_gives_the_same_features(precision: str) -> None:
     config = small_config(backbone=EfficientNetLiteConfig())
     model, inputs = BEVFormer(config).eval(), small_inputs(0)
@@ -193,7 +193,9 @@ def model(page) -> Network:
     return model
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.03)])
+@pytest.mark.parametrize(
+    ("precision", "tolerance"), [("fp32", 1e-5), pytest.param("bf16", 0.03, marks=pytest.mark.slow)]
+)
 def test_a_prepared_model_equals_the_plain_one(model, precision, tolerance):
     inputs, prepared = small_inputs(), prepare_for_inference(model, torch.device("cpu"), precision)
     with torch.inference_mode():
@@ -214,6 +216,7 @@ def test_only_what_is_certain_is_folded_and_packed(model):
     assert isinstance(stage[2].expand, PackedConvolution) == has_onednn(torch.float32)
 
 
+@pytest.mark.slow
 def test_its_stages_can_be_frozen_and_have_names(page, model, monkeypatch):
     backbone = page.OwnBackboneConfig().build()
     backbone.freeze(1)

@@ -151,7 +151,7 @@ def test_the_fast_form_gives_the_same_maps(backbone) -> None:
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-4), ("bf16", 3e-2)])
-@pytest.mark.parametrize("levels", [2, 3])
+@pytest.mark.parametrize("levels", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_a_prepared_model_gives_the_same_features(backbone, precision, tolerance, levels) -> None:
     config = NanoDetConfig(output_stages=(1, 2, 3)[:levels])
     model, inputs = small_model(backbone=config, neck=FPNConfig(levels=levels)), small_inputs()

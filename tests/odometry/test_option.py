@@ -158,6 +158,7 @@ def test_a_drive_of_a_batch_is_measured(folder, measuring):
     assert len(measuring) == 1
 
 
+@pytest.mark.slow
 def test_a_validation_scores_drives_without_poses(folder, tmp_path, measuring):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     model = bevcli.load_model(tmp_path / "mini.toml", untrained=True)
@@ -213,6 +214,7 @@ def test_a_drive_without_poses_gets_four_files_and_a_table(tmp_path, measured_tr
     assert bevcli.open_sequence(folder, ego_motion_file=out / "ego_motion.csv").has_ego_motion
 
 
+@pytest.mark.slow
 def test_the_mistake_of_stated_poses_is_named(tmp_path, measured_truly):
     folder = street_copy(tmp_path / "drive", COMMAND_FRAMES)
     rows = [line.split(",") for line in (STREET / "ego_motion.csv").read_text().splitlines()]

@@ -79,7 +79,10 @@ def measured(step: Array, frames: int = 3) -> list[MeasuredStep]:
 
 @pytest.mark.parametrize(
     "step",
-    [rigid((1.1, 0.03, 0), rotation_about_z(0.05)), rigid((-0.9, 0.02, 0), rotation_about_z(-0.04))],
+    [
+        rigid((1.1, 0.03, 0), rotation_about_z(0.05)),
+        pytest.param(rigid((-0.9, 0.02, 0), rotation_about_z(-0.04)), marks=pytest.mark.slow),
+    ],
     ids=["forwards in a curve", "backwards"],
 )
 def test_a_motion_is_found_in_metres(step: Array) -> None:

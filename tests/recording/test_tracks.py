@@ -51,6 +51,7 @@ def test_only_shown_boxes_with_a_track_have_a_trail(tmp_path):
     assert len(last.values(entities.BEV_TRACKS, "LineStrips2D:strips")) == 2
 
 
+@pytest.mark.slow
 def test_the_past_ends_after_some_seconds_and_with_the_scene(tmp_path):
     frames = record_tracks(tmp_path / "r.rrd", 25, lambda place: ["7", "8", ""], scenes="a" * 20 + "b" * 10)
     step_s = 0.5

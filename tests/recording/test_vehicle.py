@@ -148,6 +148,7 @@ def test_a_text_mesh_over_16_mib_is_refused_unread(tmp_path, in_this_process):
         load_vehicle(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limit", "value", "message"),
     [("MEMORY", 100 << 20, "takes more than 1 GiB of memory"), ("SECONDS", 0.05, "s to read")],
@@ -161,6 +162,7 @@ def test_a_mesh_that_takes_too_much_is_an_error_of_one_line(tmp_path, monkeypatc
     assert str(caught.value).startswith(str(path))
 
 
+@pytest.mark.slow
 def test_a_mesh_is_read_with_our_packages_not_the_folders(tmp_path, monkeypatch):
     van().export(tmp_path / "van.ply")
     for name in ("trimesh", "resource", "numpy"):
@@ -182,6 +184,7 @@ def test_a_mesh_in_millimetres_is_an_error(tmp_path, in_this_process):
         load_vehicle(tmp_path / "van.stl")
 
 
+@pytest.mark.slow
 def test_the_default_car_is_drawn_without_trimesh(tmp_path):
     code = (
         "import sys, bevcli.recording.writer\n"

@@ -57,6 +57,7 @@ def test_the_images_of_a_recording_come_back(tmp_path):
         assert cv2.PSNR(images.image(frame, "CAM_BACK"), scene(place)) > 33
 
 
+@pytest.mark.slow
 @with_av
 def test_a_dropped_image_starts_a_new_stream(tmp_path):
     record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=4), RecordingOptions(images="av1"))

@@ -113,6 +113,7 @@ def test_an_error_is_exit_code_3_and_one_json_object(tmp_path, undrawn):
     assert sum(report["coverage"]["cells_by_cameras"].values()) == 10_000
 
 
+@pytest.mark.slow
 def test_what_run_refuses_is_explained(tmp_path):
     document = copy_of("six")
     del document["cameras"]["CAM_BACK"]["intrinsics"]
@@ -147,6 +148,7 @@ def test_a_healthy_sequence(small_drive, tmp_path, undrawn):
     assert codes <= {"cells-unseen", "overlap-far", "motion-not-measured"}
 
 
+@pytest.mark.slow
 def test_a_calibration_with_another_folder_s_images(small_drive, tmp_path):
     path = tmp_path / "mine.json"
     shutil.move(small_drive / "calibration.json", path)
@@ -197,6 +199,7 @@ def test_the_viewer_shows_all_views_of_the_recording(small_drive, tmp_path):
     assert cv2.imread(str(tmp_path / "shot.png")).std() > 10
 
 
+@pytest.mark.slow
 def test_the_command_prints_what_the_library_returns(small_drive, tmp_path, undrawn):
     write_motion(small_drive, heading=(0.5**0.5, 0, 0, 0.5**0.5))
     check = check_calibration(str(small_drive), frame=3)

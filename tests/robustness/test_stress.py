@@ -96,6 +96,7 @@ def test_the_clean_scores_are_those_of_validate(whole, model, drives):
     assert drives_table(together.drives).splitlines()[-1].startswith("mAP: mean 0.")
 
 
+@pytest.mark.slow
 def test_an_interrupted_test_resumed_gives_the_same_bytes(whole, model, drives, tmp_path):
     out, runs, is_complete = tmp_path / "out", 0, False
     while runs < 50 and not is_complete:
@@ -107,6 +108,7 @@ def test_an_interrupted_test_resumed_gives_the_same_bytes(whole, model, drives, 
     assert (out / "stress.json").read_bytes() == (whole / "stress.json").read_bytes()
 
 
+@pytest.mark.slow
 def test_finished_scenes_are_not_run_again(model, drives, tmp_path):
     for done in StressTest(model, drives, CONDITIONS[:2], tmp_path).run():
         if done == FRAMES + 2:
@@ -127,6 +129,7 @@ def test_a_resumed_test_may_get_more_conditions_no_other_options(whole, model, d
         stress(model, drives, CONDITIONS, tmp_path)
 
 
+@pytest.mark.slow
 def test_another_seed_gives_other_scores(model, drives, tmp_path):
     part = [each for each in CONDITIONS if each.name in ("clean", "calibration_noise")]
     scores = []

@@ -324,7 +324,7 @@ class BreaksOff(MemoryDrive):
         return super().load(place)
 
 
-@pytest.mark.parametrize("broken", [0, 1])
+@pytest.mark.parametrize("broken", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_run_that_fails_at_once_leaves_nothing(mini_model, tmp_path, broken):
     """Beside what was in the folder before. With a frame, there is something to resume."""
     (tmp_path / "before").mkdir()

@@ -91,9 +91,7 @@ def assert_equals(out: Path, whole: Path) -> None:
         assert one[key] == other[key]
 
 
-@pytest.mark.parametrize(
-    "finished", [pytest.param(n, marks=[pytest.mark.slow] * (n in (1, 2, 3, 4, 5))) for n in range(FRAMES + 1)]
-)
+@pytest.mark.parametrize("finished", [pytest.param(n, marks=[pytest.mark.slow] * (n != 3)) for n in range(FRAMES + 1)])
 def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finished):
     drive = MadeDrive()
     drive.broken = finished
@@ -108,6 +106,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finis
     assert_equals(out, whole)
 
 
+@pytest.mark.slow
 def test_a_run_may_be_interrupted_after_every_frame(model, whole, tmp_path):
     out = tmp_path / "out"
     for broken in range(2, FRAMES):
@@ -298,6 +297,7 @@ def test_changed_images_are_seen(model, tmp_path):
         run_all(model, out, WithImages(), resume=True)
 
 
+@pytest.mark.slow
 def test_nothing_is_deleted_or_written_through_links(model, interrupted):
     elsewhere = interrupted.parent / "elsewhere"
     (elsewhere / "maps").mkdir(parents=True)

@@ -144,6 +144,7 @@ assert sorted(read_recording(folder / "r.rrd").frames[0].boxes.lanes.tolist()) =
 """
 
 
+@pytest.mark.slow
 def test_a_new_column_is_one_line(tmp_path):
     source = Path(bevcli.geometry.boxes.__file__).read_text()
     assert source.count(BEFORE) == 1

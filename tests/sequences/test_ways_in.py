@@ -65,6 +65,7 @@ def write_videos(source: Path, target: Path, suffix: str) -> None:
         writer.release()
 
 
+@pytest.mark.slow
 def test_nuscenes_root_gives_the_same_frames(real_drive, nuscenes_root):
     sequence = open_sequence(nuscenes_root)
     assert sequence.has_ego_motion
@@ -98,7 +99,7 @@ def test_lossless_videos_give_the_same_frames(real_drive, tmp_path, suffix):
     assert_same_frames(open_sequence(real_drive), open_sequence(tmp_path / "videos_in"), same_bytes=False)
 
 
-@pytest.mark.parametrize("which", ["native", "nuscenes"])
+@pytest.mark.parametrize("which", [pytest.param("native", marks=pytest.mark.slow), "nuscenes"])
 def test_converted_sequence_gives_the_same_frames(real_drive, nuscenes_root, tmp_path, which):
     source = open_sequence(real_drive if which == "native" else nuscenes_root)
     with NativeWriter(tmp_path / "out", with_ego_motion=True) as writer:

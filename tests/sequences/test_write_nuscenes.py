@@ -122,7 +122,7 @@ def predictions(drive, model):
     return [prediction for _, prediction in bevcli.run(model, drive)]
 
 
-@pytest.mark.parametrize("lens", [None, [-0.2, 0.05, 0, 0]])
+@pytest.mark.parametrize("lens", [pytest.param(None, marks=pytest.mark.slow), [-0.2, 0.05, 0, 0]])
 def test_predictions_are_the_same(drive, mini_model, tmp_path, lens):
     calibration = json.loads((drive / "calibration.json").read_text())
     if lens is not None:

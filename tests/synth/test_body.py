@@ -62,6 +62,7 @@ def mean_turns_deg(speeds: np.ndarray, yaw_rate: float) -> np.ndarray:
     return np.degrees(np.mean([[np.interp(times, b.times, turn) for turn in b.turns.T] for b in bodies], axis=0)).T
 
 
+@pytest.mark.slow
 def test_the_nose_goes_down_under_braking_and_the_body_leans_out():
     braking = mean_turns_deg(np.concatenate([np.full(40, 12.0), np.linspace(12, 3, 30), np.full(50, 3.0)]), 0.0)
     assert braking[50:68, 0].min() > 0.3  # 3 m/s²
@@ -94,6 +95,7 @@ def test_boxes_contain_their_pixels_where_the_body_pitches(moving, pitched):
     assert min(outside["level"]) < -2
 
 
+@pytest.mark.slow
 def test_unstated_motion_shows_in_images_but_not_in_poses(moving, pitched, assets, drive):
     unstated = drive_with("unstated", assets)
     frame = unstated.frame(PITCHED)
@@ -107,6 +109,7 @@ def test_unstated_motion_shows_in_images_but_not_in_poses(moving, pitched, asset
     assert np.abs(moving.ego_motion().quaternions[:, 1:3]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_still_body_is_the_drive_without_the_option(drive, frame, assets):
     still = drive_with("still", assets).frame(9)
     assert all(np.array_equal(still.images[name], image) for name, image in frame.images.items())

@@ -87,6 +87,7 @@ def rendered(assets: Assets, index: int, varied: bool) -> RenderedFrame:
     return RenderedDrive(5, 2, rig=DrawnRig(nuscenes_like_rig(96, 54), varied=varied), assets=assets).frame(index)
 
 
+@pytest.mark.slow
 def test_varied_looks_change_the_images_and_keep_the_boxes(assets: Assets) -> None:
     plain, varied, again = rendered(assets, 1, False), rendered(assets, 1, True), rendered(assets, 1, True)
 

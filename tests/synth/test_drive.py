@@ -28,6 +28,7 @@ def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFra
     assert frame.bev_map.cells.tobytes() == other.bev_map.cells.tobytes()
 
 
+@pytest.mark.slow
 def test_another_seed_is_another_drive(frame: RenderedFrame, assets: Assets):
     front = CameraRig(nuscenes_like_rig(320, 180).cameras[:1], np.eye(4))
     other = RenderedDrive(114, rig=front, assets=assets, weather="noon").frame(9)
@@ -140,6 +141,7 @@ def _turned(drive: RenderedDrive, index: int) -> float:
     return float(abs(wrap_angle(poses[1].yaw - poses[0].yaw)))
 
 
+@pytest.mark.slow
 def test_ego_motion_is_plausible_for_a_car(assets: Assets):
     """For several seeds: accelerations below 4 m/s², and velocities that agree with the poses."""
     for seed in (3, 8):

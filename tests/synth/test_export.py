@@ -62,6 +62,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_second_export_gives_the_same_files(written: tuple[RenderedDrive, Path], tmp_path: Path, assets: Assets):
     again = RenderedDrive(5, frames=2, rig=nuscenes_like_rig(160, 90), assets=assets, threads=2)
     export_drive(again, tmp_path)
@@ -105,6 +106,7 @@ def test_a_lens_too_wide_for_its_model_is_an_error(tmp_path: Path):
         rig_for_rendering(tmp_path / "rig.json", None)
 
 
+@pytest.mark.slow
 def test_the_function_takes_a_rig_and_summarises_what_it_wrote(tmp_path: Path):
     rig = nuscenes_like_rig(96, 54)
     summary = render_sequence(tmp_path / "out", seed=4, frames=2, rig=replace(rig, cameras=rig.cameras[3:4]))

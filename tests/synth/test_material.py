@@ -60,6 +60,7 @@ def varied(folder: Path, assets: Assets) -> RenderedDrive:
     return drive(assets, folder)
 
 
+@pytest.mark.slow
 def test_a_drive_with_material_is_the_same_each_time(varied: RenderedDrive, folder: Path, assets: Assets) -> None:
     image(varied, 0)
 
@@ -76,6 +77,7 @@ def test_the_sky_of_a_drive_is_the_photograph(varied: RenderedDrive) -> None:
     assert red > blue > green + 30
 
 
+@pytest.mark.slow
 def test_what_is_not_drawn_anew_stays_in_place(varied: RenderedDrive, assets: Assets) -> None:
     plain, with_material = drive(assets, "").frame(0), varied.frame(0)
     fixed = [name for name in plain.boxes.instances if name.startswith(("rack", "standing", "fence", "site"))]

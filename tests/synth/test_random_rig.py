@@ -120,6 +120,7 @@ def test_a_late_camera_sees_objects_where_they_are_then(delayed: tuple[RenderedD
     assert compared
 
 
+@pytest.mark.slow
 def test_other_cameras_of_a_drive_with_a_late_one_are_unchanged(delayed, rendered: RenderedFrame):
     np.testing.assert_array_equal(delayed[2].images["CAM_BACK"], rendered.images["CAM_BACK"])
     assert (delayed[2].images["CAM_FRONT_LEFT"] != rendered.images["CAM_FRONT_LEFT"]).any()
@@ -138,6 +139,7 @@ def rendered(drive, lens, **changes):
     return one.frame(9).images["CAM_FRONT"].astype(np.float64), camera
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LENSES)
 def test_undistorted_rendering_resembles_one_without_a_lens(drive, name):
     plain, _ = rendered(drive, None)

@@ -100,6 +100,7 @@ def other_teacher(tmp_path_factory: pytest.TempPathFactory) -> DistillationLossC
     return DistillationLossConfig(0.0, 1.0, str(folder / "other.safetensors"), str(folder / "other.toml"))
 
 
+@pytest.mark.slow
 def test_a_teacher_of_another_normalisation_sees_the_same_images(
     model: BEVFormer, other_teacher: DistillationLossConfig
 ) -> None:
@@ -120,6 +121,7 @@ def test_a_teacher_of_another_normalisation_sees_the_same_images(
                 torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_model_learns_the_features_of_a_teacher(other_teacher: DistillationLossConfig, tmp_path: Path) -> None:
     augmentation = replace(NOISE, randomisation=RandomisationConfig(convolution=0.5, contrast=0.5))
     losses = learned(replace(other_teacher, feature_weight=100.0), augmentation, tmp_path, "features")

@@ -101,7 +101,7 @@ def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:
             assert torch.equal(own.detection[0].labels, of_batch.detection[place].labels)
 
 
-@pytest.mark.parametrize("in_bytes", [False, True])
+@pytest.mark.parametrize("in_bytes", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_batches_of_kept_images_are_those_of_images_read_anew(in_bytes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     worst = replace(NOISE, corrupted_share=0.6, lost_cameras_share=0.5, drop_image=0.2, white_balance=0.2)
     plain, turns, reads, load = maker(worst, in_bytes=in_bytes), [(0, 0), (1, 0), (2, 0)], [], PaintedDrive.load

@@ -108,6 +108,7 @@ def test_a_signal_requests_a_stop(number: int, exit_code: int) -> None:
     assert signal.getsignal(number) is before
 
 
+@pytest.mark.slow
 def test_a_seed_reproduces_and_another_one_differs(two_steps: Trainer, tmp_path: Path) -> None:
     again, other = (trainer(tmp_path / str(seed), seed, settings=TWO_STEPS) for seed in (0, 1))
     list(again.run())
@@ -173,6 +174,7 @@ def test_every_parameter_receives_a_gradient_that_is_not_zero(two_steps: Trainer
     assert parameters_without_gradient(two_steps) == []
 
 
+@pytest.mark.slow
 def test_frozen_stages_keep_weights_and_statistics(tmp_path: Path) -> None:
     trained = trainer(tmp_path, settings=replace(SHORT, frozen_stages=1))
     before = {name: value.clone() for name, value in trained.job.model.backbone.state_dict().items()}
@@ -182,6 +184,7 @@ def test_frozen_stages_keep_weights_and_statistics(tmp_path: Path) -> None:
     assert {"stages.1.0.conv1.weight", "stages.1.0.bn1.running_mean"} <= changed
 
 
+@pytest.mark.slow
 def test_randomised_images_are_drawn_anew_but_by_the_seed(two_steps: Trainer, tmp_path: Path) -> None:
     augmentation = AugmentationConfig(randomisation=RandomisationConfig(convolution=0.5, noise=0.5))
     runs = [trainer(tmp_path / str(run), settings=replace(TWO_STEPS, augmentation=augmentation)) for run in range(2)]

@@ -52,6 +52,7 @@ def losses(settings: TrainingConfig, out: Path, device: torch.device, waits: lis
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings", [pytest.param(PLAIN, id="plain"), pytest.param(ALL_PARTS, id="all parts", marks=pytest.mark.slow)]
 )

@@ -25,6 +25,7 @@ def recording(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_complete_recording_is_read_from_its_own_file(recording, monkeypatch):
     monkeypatch.setattr(recording_file, "run_python", run_python)  # a process as the user's
     with open_recording(recording) as file:
@@ -59,7 +60,7 @@ def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, conten
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("bev", ["pca", "none"])
+@pytest.mark.parametrize("bev", ["pca", pytest.param("none", marks=pytest.mark.slow)])
 def test_a_resumed_recording_shows_all_frames(tmp_path, bev):
     path, sequence, options = tmp_path / "recording.rrd", MemoryDrive(6), RecordingOptions(bev=bev)
     frames = [sequence.load(place) for place in range(6)]
@@ -152,6 +153,7 @@ def test_a_message_of_unknown_kind_is_damage_not_the_end(recording, tmp_path, me
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the memory of a process")
 def test_the_first_process_to_read_a_recording_has_one_gigabyte(recording):
     greedy = recording_file.CHECK.replace("try:\n", "bytearray(1200 << 20)\ntry:\n")

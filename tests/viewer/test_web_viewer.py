@@ -201,6 +201,7 @@ def test_a_port_in_use_is_replaced_by_another(viewer, tmp_path):
     second.server_close()
 
 
+@pytest.mark.slow
 def test_the_assets_are_the_files_of_the_viewer(viewer):
     assets = web_viewer_assets()
     assert assets["/re_viewer_bg.wasm"].startswith(b"\0asm")
