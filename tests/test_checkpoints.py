@@ -60,7 +60,7 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("model", ["tiny", "small", "base"])
+@pytest.mark.parametrize("model", ["tiny", pytest.param("small", marks=pytest.mark.slow), "base"])
 def test_official_keys_map_one_to_one_to_the_keys_of_our_model(model: str) -> None:
     state = {key: torch.empty(shape, device="meta") for key, shape in KEYS[model].items()}
     assert compare(from_official(state)[0], expected_state(load_config(model))) == {}
@@ -346,14 +346,19 @@ def test_the_error_for_a_missing_file_names_it(tmp_path: Path) -> None:
         read_checkpoint(tmp_path / "nothing.pth")
 
 
-def test_every_parameter_of_a_model_belongs_to_one_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in known_models():
-        config = load_config(name)
-        with torch.device("meta"):
-            model = build_model(config)
-        monkeypatch.setattr(parts, "build_model", lambda config, model=model: model)  # it takes seconds for all models
-        expected = sum(parameter.numel() for parameter in model.parameters())
-        assert sum(part.parameters for part in model_parts(config)) == expected
+PARTS_OF = ("photographs", "uniad-track-map", "v2-t1", "vad-tiny")  # one of each class
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in PARTS_OF)) for name in known_models()]
+)
+def test_every_parameter_of_a_model_belongs_to_one_part(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(name)
+    with torch.device("meta"):
+        model = build_model(config)
+    monkeypatch.setattr(parts, "build_model", lambda config: model)
+    expected = sum(parameter.numel() for parameter in model.parameters())
+    assert sum(part.parameters for part in model_parts(config)) == expected
 
 
 def test_the_parts_of_base_have_the_published_sizes() -> None:

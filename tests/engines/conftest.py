@@ -13,6 +13,7 @@ from bevcli.workshop.engines.export_onnx import export_onnx, quantize
 
 @pytest.fixture(scope="session")
 def small_file(tmp_path_factory) -> Path:
+    pytest.importorskip("onnxscript")  # here, as the import takes a second of each worker
     model, file = model_for_engines(), tmp_path_factory.mktemp("small") / "small.onnx"
     contents = as_table(model.config, TrackerConfig(birth_score=0.5))
     export_onnx(model, file, contents=contents, decode=True, untrained=True)

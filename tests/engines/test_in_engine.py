@@ -24,7 +24,6 @@ from bevcli.workshop.engines import engine as module
 from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine, RoundingOpenVinoEngine
 from bevcli.workshop.engines.exported import load_exported
 
-pytest.importorskip("onnxscript")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("openvino")
 STREET = Path(__file__).parents[2] / "samples" / "street"

@@ -42,7 +42,7 @@ def clips_of(config: BEVFormerV2Config, frames: int = 2) -> Batch:
 
 
 @pytest.mark.parametrize("config", [V1, WINDOW], ids=["BEVFormer", "BEVFormerV2"])
-@pytest.mark.parametrize("learn_all", [False, True])
+@pytest.mark.parametrize("learn_all", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, learn_all: bool) -> None:
     """With batch norms in evaluation mode, and without dropout."""
     torch.manual_seed(0)

@@ -40,7 +40,6 @@ def test_its_weights_are_in_the_package() -> None:
     loaded = load_model("demo")
     assert loaded.weights == bundled_weights("demo")
     assert loaded.bundled
-    assert load_model(untrained=True).name == "photographs"
     of_a_file = load_model(None, bundled_weights("demo"))  # they name their model
     assert (of_a_file.name, of_a_file.bundled) == ("demo", False)
 
