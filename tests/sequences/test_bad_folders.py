@@ -192,6 +192,13 @@ def test_image_name_that_is_not_a_number(drive):
     assert "two.png" in message(drive)
 
 
+@pytest.mark.parametrize("option", [{"start_ns": 5}, {"image_rate_hz": 2.0}, {"times": "ns"}])
+def test_times_of_images_beside_a_table_that_states_them(drive, option):
+    line = message(drive, **option)
+    assert "frames.csv: states the times of all images" in line
+    assert f"`{next(iter(option))}` " in line
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [

@@ -33,6 +33,7 @@ LINES_FILE = "ground_truth_lines.json"
 VIDEO_CELL = re.compile(r"(?P<path>.+)#(?P<index>[0-9]{1,9})")
 EGO_MOTION_FILE = named(FolderOptions, "ego_motion_file")
 NO_IMAGE = "no image in frames.csv"
+IMAGE_TIMES = ("times", "image_rate_hz", "start_ns")  # options of folders without frames.csv
 
 
 class FolderDrive(ListedDrive):
@@ -58,6 +59,10 @@ class FolderDrive(ListedDrive):
         rig, facts = draft.rig, draft.facts
         table, file = path / "frames.csv", own.ego_motion_file or path / "ego_motion.csv"
         entries = read_frames_table(table, rig.names) if is_there(table) else ()
+        for name in IMAGE_TIMES if entries else ():
+            if getattr(own, name) is not None:
+                without = f"{named(FolderOptions, name)} would have no effect"
+                raise InputError(f"{table}: states the times of all images, and {without}: remove the option")
         is_open = bool(draft.readings)
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries), is_open))
         self.understood, left_out, advice = "", "", "add ego-motion, or remove the frame"

@@ -11,10 +11,9 @@ import pyarrow as pa  # which rerun brings, so that it is installed anyway
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes, nearest
+from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
@@ -25,6 +24,7 @@ from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_fr
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import Argoverse2Options
 from bevcli.workshop.formats.labels import with_track_velocities
+from bevcli.workshop.formats.matching import FARTHEST, CameraImages, frames_at
 
 # Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
 # and STROLLER, stay as they are, and are not scored.
@@ -58,10 +58,9 @@ RING = (
 STEREO = ("stereo_front_left", "stereo_front_right")
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3")
 SPACING_NS = 100_000_000  # time between the poses that kinematics are derived from; the table has some 5 µs apart
-NEAR_NS = 26_000_000  # half the time between two images of a camera, which has 20 per second, and some jitter
+PERIOD_NS = 52_000_000  # from one image of a camera to the next, of which it has 20 per second, and some jitter
 SIZE = ("length_m", "width_m", "height_m")
 ANNOTATIONS = "annotations.feather"
-Times = NDArray[np.int64]
 
 
 class FeatherTable:
@@ -144,11 +143,11 @@ def open_log(path: Path, common: InputOptions, options: Argoverse2Options) -> Li
     common.refuse_static(path)
     rig = _read_rig(path / "calibration", options)
     motion = _read_motion(path / "city_SE3_egovehicle.feather", options.axle_height_m)
-    images = {name: _image_times(path / "sensors/cameras" / name) for name in rig.names}
+    images = {name: _images(path / "sensors/cameras" / name) for name in rig.names}
     annotated = (path / ANNOTATIONS).exists()
     names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
     boxes = _read_annotations(path / ANNOTATIONS, motion, options, names) if annotated else {}
-    entries, notes = _entries(path, rig, images, np.array(sorted(boxes), dtype=np.int64))
+    entries, notes = _entries(path, images, np.array(sorted(boxes), dtype=np.int64))
     times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []
     truth = {index: boxes[time] for index, time in enumerate(times) if time in boxes}
     notes = (*bev_frame_notes(rig, "an Argoverse 2 log"), *notes)
@@ -199,11 +198,13 @@ def _camera(
     return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, distortion), path)
 
 
-def _image_times(folder: Path) -> Times:
-    """(N,) ns, increasing, of the images TIMESTAMP.jpg in a camera's folder; none without the folder."""
+def _images(folder: Path) -> CameraImages:
+    """The images TIMESTAMP.jpg in a camera's folder; none without the folder."""
     names = [file.stem for file in folder.glob("*.jpg")] if folder.is_dir() else []
-    times = [int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19]
-    return np.array(sorted(time for time in times if time <= LARGEST_INTEGER), dtype=np.int64)
+    numbers = (int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19)
+    times = sorted(time for time in numbers if time <= LARGEST_INTEGER)
+    sources = [ImageSource(folder / f"{time}.jpg", time) for time in times]
+    return CameraImages(folder.name, np.array(times, dtype=np.int64), PERIOD_NS, sources.__getitem__)
 
 
 def _read_annotations(
@@ -231,30 +232,16 @@ def _read_annotations(
 
 
 def _entries(
-    path: Path, rig: CameraRig, images: Mapping[str, Times], annotated: Times
+    path: Path, images: Mapping[str, CameraImages], annotated: NDArray[np.int64]
 ) -> tuple[tuple[FrameEntry, ...], tuple[str, ...]]:
-    leading = next((times for times in images.values() if len(times)), None)
+    folder = path / "sensors/cameras"
+    leading = next((name for name, of_camera in images.items() if len(of_camera.times_ns)), None)
     if leading is None:
-        raise InputError(
-            f"{path / 'sensors/cameras'}: has no images (expected {rig.names[0]}/TIMESTAMP_NS.jpg and others)"
-        )
-    times = annotated if len(annotated) else leading
-    near = f"within {NEAR_NS / 1e6:.0f} ms"
-    entries = []
-    for index, time in enumerate(times.tolist()):
-        if sources := _sources(path / "sensors/cameras", images, time):
-            dropped = {name: f"has no image {near} of the frame" for name in rig.names if name not in sources}
-            entries.append(FrameEntry(FrameStamp(index, "", time), sources, dropped, str(path)))
+        raise InputError(f"{folder}: has no images (expected {next(iter(images))}/TIMESTAMP_NS.jpg and others)")
+    times = annotated if len(annotated) else images[leading].times_ns
+    entries = frames_at(times, images, leading)
     if not entries:
+        near = f"within {FARTHEST * PERIOD_NS / 1e6:.0f} ms"
         raise InputError(f"{path}: no image is {near} of a time that has boxes in {ANNOTATIONS}")
     note = f"{len(times) - len(entries)} of {len(times)} frames have no image and are left out"
-    return tuple(entries), (note,) if len(entries) < len(times) else ()
-
-
-def _sources(folder: Path, images: Mapping[str, Times], time: int) -> dict[str, ImageSource]:
-    sources = {}
-    for name, times in images.items():
-        image_ns = int(times[nearest(times, time)]) if len(times) else None
-        if image_ns is not None and abs(image_ns - time) <= NEAR_NS:
-            sources[name] = ImageSource(folder / name / f"{image_ns}.jpg", image_ns)
-    return sources
+    return entries, (note,) if len(entries) < len(times) else ()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, nearest
 from bevcli.printing import counted
-from bevcli.sequences.images import FrameEntry, ImageSource
+from bevcli.sequences.images import FrameEntry, Source
 
 FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
 GAP = 1.5  # periods from an image to the next where one was lost
@@ -33,11 +33,13 @@ class CameraImages:
     name: str
     times_ns: NDArray[np.int64]
     period_ns: float
-    image: Callable[[int], ImageSource]
+    image: Callable[[int], Source]
     is_uneven: bool = False
 
     def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""
+        if not len(self.times_ns):
+            return np.zeros(len(times_ns), dtype=np.int64), np.zeros(len(times_ns), dtype=np.bool_)
         indices = nearest(self.times_ns, times_ns)
         return indices, np.abs(self.times_ns[indices] - times_ns) <= FARTHEST * self.period_ns
 
@@ -75,11 +77,16 @@ def match(cameras: Mapping[str, CameraImages]) -> Matched:
     Where this camera lost images, the frames have those of the others.
     """
     leading, slowest = max(cameras.items(), key=lambda item: item[1].period_ns)
-    times = _without_gaps(slowest)
-    nearest = {camera: images.nearest(times) for camera, images in cameras.items()}
+    entries = frames_at(_without_gaps(slowest), cameras, leading)
+    apart = (source.timestamp_ns - entry.stamp.timestamp_ns for entry in entries for source in entry.sources.values())
+    return Matched(entries, leading, max(map(abs, apart), default=0), sum(len(entry.dropped) for entry in entries))
+
+
+def frames_at(times_ns: NDArray[np.int64], cameras: Mapping[str, CameraImages], leading: str) -> tuple[FrameEntry, ...]:
+    """The frames at some times, with the nearest image of each camera. leading: the camera that errors name."""
+    nearest = {camera: images.nearest(times_ns) for camera, images in cameras.items()}
     entries: list[FrameEntry] = []
-    farthest = missing = 0
-    for row, time in enumerate(times.tolist()):
+    for row, time in enumerate(times_ns.tolist()):
         there = {camera: int(indices[row]) for camera, (indices, is_near) in nearest.items() if is_near[row]}
         if not there:
             continue
@@ -89,11 +96,9 @@ def match(cameras: Mapping[str, CameraImages]) -> Matched:
             for camera, images in cameras.items()
             if camera not in there
         }
-        farthest = max(farthest, *(abs(source.timestamp_ns - time) for source in sources.values()))
-        missing += len(dropped)
         label = sources.get(leading, next(iter(sources.values())))
         entries.append(FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, str(label)))
-    return Matched(tuple(entries), leading, farthest, missing)
+    return tuple(entries)
 
 
 def _without_gaps(images: CameraImages) -> NDArray[np.int64]:

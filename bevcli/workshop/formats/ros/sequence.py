@@ -7,7 +7,6 @@ packets from a keyframe to the next are written to a temporary file, and read fr
 import re
 import tempfile
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import CameraImage, DriveFacts, FrameStamp
+from bevcli.frame import CameraImage, DriveFacts
 from bevcli.geometry.cameras import CameraRig
-from bevcli.geometry.ego_motion import EgoMotion, nearest
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.parsing.files import is_there
 from bevcli.parsing.images import decode_image, media_type_of, size_of_image
 from bevcli.printing import one_line
@@ -31,6 +30,7 @@ from bevcli.sequences.native.folder import decided
 from bevcli.sequences.options import InputOptions
 from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
+from bevcli.workshop.formats.matching import CameraImages, frames_at
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
 from bevcli.workshop.formats.ros.vehicle import VehicleReader, capture_times, find_geo_origin
@@ -64,9 +64,11 @@ SAME_RATE = 0.98  # cameras whose rates differ by less have the same rate; the f
 EGO_MOTION_FILE = "ego_motion.csv"
 
 
-def bag_image(bag: Bag, topic: str, numbers: NDArray[np.int64], index: int, time_ns: int) -> images.MessageSource:
-    """Image `index` of a topic, read on demand. numbers: (N,) of its messages in order of capture. time_ns: roughly."""
-    number = int(numbers[index])
+def bag_image(
+    bag: Bag, topic: str, times_ns: NDArray[np.int64], numbers: NDArray[np.int64], index: int
+) -> images.MessageSource:
+    """Image `index` of a topic, read on demand. times_ns, numbers: (N,) of its messages in order of capture."""
+    number, time_ns = int(numbers[index]), int(times_ns[index])
     name = f"{bag.path}: {topic}: message {number}"
     return images.MessageSource(name, time_ns, lambda: _read_message(bag, topic, number, time_ns, name))
 
@@ -146,9 +148,9 @@ class BagVideo:
     Raises InputError for a format that is not supported.
     """
 
-    def __init__(self, bag: Bag, topic: str, numbers: NDArray[np.int64]) -> None:
-        """numbers: (N,) of the topic's messages in order of capture."""
-        self._bag, self._topic, self._numbers = bag, topic, numbers.tolist()
+    def __init__(self, bag: Bag, topic: str, times_ns: NDArray[np.int64], numbers: NDArray[np.int64]) -> None:
+        """times_ns, numbers: (N,) of the topic's messages in order of capture."""
+        self._bag, self._topic, self._times, self._numbers = bag, topic, times_ns.tolist(), numbers.tolist()
         self._format = str(bag.message(topic, 0).format).lower()
         if self._format not in VIDEO_FORMATS:
             expected = " or ".join(VIDEO_FORMATS)
@@ -158,12 +160,12 @@ class BagVideo:
         self._reader: VideoReader | None = None
         self._lock = threading.Lock()
 
-    def image(self, index: int, time_ns: int) -> images.MessageSource:
-        """The source of image `index`. time_ns: according to the index of the bag."""
+    def image(self, index: int) -> images.MessageSource:
+        """The source of image `index`."""
         name = f"{self._bag.path}: {self._topic}: message {self._numbers[index]}"
-        return images.MessageSource(name, time_ns, lambda: self.read(index, time_ns))
+        return images.MessageSource(name, self._times[index], lambda: self.read(index))
 
-    def read(self, index: int, time_ns: int) -> CameraImage:
+    def read(self, index: int) -> CameraImage:
         """Image `index`. Raises UnreadableImage if it cannot be decoded."""
         with self._lock:
             try:
@@ -171,7 +173,7 @@ class BagVideo:
                     self._open_group(index)
                 assert self._reader is not None
                 pixels = self._reader.read(index - self._group.start)
-                time = timestamp_ns(self._bag.message(self._topic, self._numbers[index])) or time_ns
+                time = timestamp_ns(self._bag.message(self._topic, self._numbers[index])) or self._times[index]
             except InputError as error:
                 raise images.UnreadableImage(f"{self._topic}: image {index} cannot be decoded ({error})") from None
         return CameraImage(time, pixels)
@@ -277,34 +279,19 @@ def _files_beside(
 
 def _entries(bag: Bag, cameras: tuple[CameraTopics, ...]) -> tuple[images.FrameEntry, ...]:
     """One frame for each image of the camera with the lowest rate, with the other cameras' nearest images."""
+    cameras_images: dict[str, CameraImages] = {}
     captured = capture_times(bag, [camera.images for camera in cameras])
-    times = {camera.camera: captured[camera.images][0] for camera in cameras}
-    # The median time between images; a second for a single one.
-    periods = {n: float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1e9 for n, stamps in times.items()}
-    slowest = max(periods.values())
-    leading = next(name for name, period in periods.items() if period >= SAME_RATE * slowest)
-    makers: dict[str, Callable[[int, int], images.Source]] = {
-        camera.camera: BagVideo(bag, camera.images, captured[camera.images][1]).image
-        if camera.is_video
-        else partial(bag_image, bag, camera.images, captured[camera.images][1])
-        for camera in cameras
-    }
-    topics = {camera.camera: camera.images for camera in cameras}
-    entries: list[images.FrameEntry] = []
-    for number, time in enumerate(times[leading].tolist()):
-        if entries and time <= entries[-1].stamp.timestamp_ns:
-            continue  # a message that was recorded twice
-        sources: dict[str, images.Source] = {}
-        dropped = {}
-        for name, stamps in times.items():
-            index = number if name == leading else int(nearest(stamps, time))
-            if abs(int(stamps[index]) - time) > 0.501 * periods[name]:
-                dropped[name] = f"{topics[name]} has no image within {periods[name] / 2e6:.0f} ms of {time} ns"
-            else:
-                sources[name] = makers[name](index, int(stamps[index]))
-        origin = f"{bag.path}: {topics[leading]}: message {captured[topics[leading]][1][number]}"
-        entries.append(images.FrameEntry(FrameStamp(len(entries), "", time), sources, dropped, origin))
-    return tuple(entries)
+    for camera in cameras:
+        times, numbers = captured[camera.images]
+        # The median time between images; a second for a single one.
+        period = float(np.median(np.diff(times))) if len(times) > 1 else 1e9
+        image = BagVideo(bag, camera.images, times, numbers).image if camera.is_video else partial(
+            bag_image, bag, camera.images, times, numbers
+        )  # fmt: skip
+        cameras_images[camera.camera] = CameraImages(camera.images, times, period, image)
+    slowest = max(images.period_ns for images in cameras_images.values())
+    leading = next(name for name, images in cameras_images.items() if images.period_ns >= SAME_RATE * slowest)
+    return frames_at(np.unique(cameras_images[leading].times_ns), cameras_images, leading)
 
 
 def _covered(
