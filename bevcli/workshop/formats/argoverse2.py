@@ -204,7 +204,7 @@ def _images(folder: Path) -> CameraImages:
     numbers = (int(name) for name in names if name.isascii() and name.isdecimal() and len(name) <= 19)
     times = sorted(time for time in numbers if time <= LARGEST_INTEGER)
     sources = [ImageSource(folder / f"{time}.jpg", time) for time in times]
-    return CameraImages(folder.name, np.array(times, dtype=np.int64), PERIOD_NS, sources.__getitem__)
+    return CameraImages(f"the folder {folder.name}", np.array(times, dtype=np.int64), PERIOD_NS, sources.__getitem__)
 
 
 def _read_annotations(

@@ -7,10 +7,11 @@ camera, 0.5 to 240 Hz: units differ by a factor of 1000. Numbers that may be ind
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from decimal import Decimal
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
 
@@ -73,6 +74,31 @@ class Reading:
         """True for times since 1970 and dates."""
         return bool(self.since)
 
+    @cached_property
+    def steps(self) -> list[Times]:
+        """Of each camera with two or more images, the steps from one to the next."""
+        return [np.diff(np.sort(times)) for times in self.values.values() if len(times) > 1]
+
+    @cached_property
+    def has_rate(self) -> bool:
+        """True for times at the rate of a camera."""
+        shortest, longest = PERIODS_NS
+        return bool(self.steps) and all(shortest <= np.median(steps) <= longest for steps in self.steps)
+
+    @property
+    def is_steady(self) -> bool:
+        """True where most steps are whole periods of the camera, more than one where an image was lost."""
+        periods = [steps / np.median(steps) for steps in self.steps]
+        return all(
+            (np.abs(of_camera - np.maximum(np.round(of_camera), 1)) <= JITTER).mean() >= STEADY for of_camera in periods
+        )
+
+    @property
+    def ends(self) -> tuple[int, int]:
+        """The smallest and the largest value."""
+        together = np.concatenate(list(self.values.values()))
+        return int(together.min()), int(together.max())
+
     def is_covered(self, motion: EgoMotion) -> bool:
         """True where the poses cover at least half of the times."""
         return bool(motion.covered(np.concatenate(list(self.values.values()))).mean() >= 0.5)
@@ -92,8 +118,8 @@ def read_names(where: Path, names: Texts, motion: EgoMotion | None, kind: TimeKi
     columns = list(_columns(where, names))
     if kind is not None:
         return _in_unit(where, columns, names, kind)
-    dates = _dates(names)
-    if dates is not None and (_has_rate(dates.values) or not _steps(dates.values)):
+    dates = _read(names, "date")
+    if dates is not None and (dates.has_rate or not dates.steps):
         return _in_time_zone(dates, motion)
     candidates = [readings for column in columns if (readings := _readings(column))]
     if not candidates:
@@ -118,7 +144,7 @@ def _decided(where: Path, names: Texts, readings: list[Reading], motion: EgoMoti
         fitting = fitting or [reading for reading in readings if reading.kind == "index"]
         if len(fitting) == 1:
             return fitting[0]
-    words = [f"{each.words} ({1e9 / np.median(_steps(each.values)[0]):.3g} Hz)" for each in times]
+    words = [f"{each.words} ({1e9 / np.median(each.steps[0]):.3g} Hz)" for each in times]
     words += ["indices of images"] if len(times) < len(readings) else []
     options = " or ".join(f'`times="{each.kind}"` (`--times`)' for each in readings)
     first = next(iter(names.values()))
@@ -162,29 +188,24 @@ def _check_counts(where: Path, names: Texts, split: Mapping[str, list[list[str]]
 def _readings(column: Texts) -> list[Reading]:
     """The possible readings of a column. One that is a time since 1970 at the rate of a camera is the only one."""
     readings, slow = list[Reading](), list[Reading]()
-    for unit in UNITS_NS:
-        reading = _read(column, unit)
-        if reading is None:
-            continue
-        steps = _steps(reading.values)
-        if reading.is_known_origin and (_has_rate(reading.values) or not steps):
+    for reading in filter(None, (_read(column, unit) for unit in UNITS_NS)):
+        medians = [float(np.median(steps)) for steps in reading.steps]
+        if reading.is_known_origin and (reading.has_rate or not medians):
             return [reading]
-        if reading.is_known_origin and all(np.median(camera_steps) >= PERIODS_NS[0] for camera_steps in steps):
-            is_usual = all(np.median(camera_steps) <= LONGEST_PERIOD_NS for camera_steps in steps)
-            (readings if is_usual else slow).append(reading)  # the slow ones if no other unit fits
-        elif _has_rate(reading.values) and _is_steady(steps) and _extent(reading.values) <= LONGEST_NS:
+        if reading.is_known_origin and min(medians) >= PERIODS_NS[0]:
+            (readings if max(medians) <= LONGEST_PERIOD_NS else slow).append(reading)  # if no other unit fits
+        elif reading.has_rate and reading.is_steady and np.ptp(reading.ends) <= LONGEST_NS:
             readings.append(reading)
     readings = readings or slow
     index = _read(column, "index")
     if index is None:
         return readings
-    steps = _steps(index.values)
-    if not steps:  # each camera has one image
-        is_time = _largest(index) >= SMALLEST_TIMESTAMP
-        return [reading] if is_time and (reading := _read(column, "ns")) else [index]
-    if _largest(index) >= LARGEST_INDEX:
+    largest = index.ends[1]
+    if not index.steps:  # each camera has one image
+        return [_read(column, "ns") or index if largest >= SMALLEST_TIMESTAMP else index]
+    if largest >= LARGEST_INDEX:
         return readings
-    pooled = np.concatenate(steps)
+    pooled = np.concatenate(index.steps)
     step = np.median(pooled)
     if step < DENSE_STEP or (not readings and step <= SPARSE_STEP):
         return [index]
@@ -192,46 +213,34 @@ def _readings(column: Texts) -> list[Reading]:
     return [*readings, index] if is_regular else readings
 
 
-def _read(column: Texts, unit: TimeKind) -> Reading | None:
-    """A column in a unit; None where two images of a camera have the same number, or one is too large or a decimal."""
-    factor = UNITS_NS.get(unit)
+def _read(column: Texts, kind: TimeKind) -> Reading | None:
+    """Texts of one kind; None where one is of another or too large, or two images of a camera have the same."""
     values = {}
     for camera, texts in column.items():
-        if factor is None and any("." in text for text in texts):
+        numbers = [_number(text, kind) for text in texts]
+        whole = [number for number in numbers if number is not None and number < 1 << 62]
+        if len(set(whole)) < len(texts):
             return None
-        numbers = [_scaled(text, factor or 1) for text in texts]
-        if max(numbers) >= 1 << 62 or len(set(numbers)) < len(numbers):
-            return None
-        values[camera] = np.array(numbers, dtype=np.int64)
+        values[camera] = np.array(whole, dtype=np.int64)
     first, last = SINCE_1970_NS
-    is_known = factor is not None and all(((v >= first) & (v < last)).all() for v in values.values())
-    return Reading(unit, values, " since 1970" if is_known else "")
+    is_known = kind in UNITS_NS and all(((v >= first) & (v < last)).all() for v in values.values())
+    return Reading(kind, values, " in UTC" if kind == "date" else " since 1970" if is_known else "")
 
 
-def _scaled(text: str, factor: int) -> int:
-    """A decimal number times a factor, rounded; without floats, which do not hold nanoseconds since 1970."""
-    whole, _, fraction = text.partition(".")
-    scale = 10 ** len(fraction)
-    return int(whole) * factor + (int(fraction or 0) * factor + scale // 2) // scale
+def _number(text: str, kind: TimeKind) -> int | None:
+    if kind == "date":
+        return date_ns(text)
+    if kind == "index":
+        return None if "." in text else int(text)
+    return scaled(text, UNITS_NS[kind])
 
 
-def scaled_ns(seconds: str) -> int | None:
-    """The nanoseconds of a decimal number of seconds, such as 1.5 or 1.5e+00; None for another text."""
+def scaled(number: str, factor: int = 10**9) -> int | None:
+    """A decimal number times a factor, such as 1.5 or 1.5e+00 seconds in nanoseconds; None for another text."""
     try:
-        return round(Decimal(seconds) * 10**9)
+        return round(Decimal(number) * factor)
     except (ArithmeticError, ValueError):
         return None
-
-
-def _dates(names: Texts) -> Reading | None:
-    """The dates in the names, None where one has none, or two of a camera are equal."""
-    values = {}
-    for camera, of_camera in names.items():
-        numbers = [date_ns(name) for name in of_camera]
-        if None in numbers or len(set(numbers)) < len(numbers):
-            return None
-        values[camera] = np.array(numbers, dtype=np.int64)
-    return Reading("date", values, " in UTC")
 
 
 def date_ns(name: str) -> int | None:
@@ -260,8 +269,8 @@ def _in_time_zone(dates: Reading, motion: EgoMotion | None) -> Reading:
 
 def _in_unit(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) -> Reading:
     """The reading of the kind that the user states, of the column that fits best."""
-    made = [_dates(names)] if kind == "date" else [_read(column, kind) for column in columns]
-    possible = [reading for reading in made if reading is not None]
+    columns = [names] if kind == "date" else columns
+    possible = [reading for column in columns if (reading := _read(column, kind)) is not None]
     if not possible:
         example = next(iter(names.values()))[0]
         expected = "dates such as 20260301120000" if kind == "date" else WORDS[kind]
@@ -269,40 +278,9 @@ def _in_unit(where: Path, columns: list[Texts], names: Texts, kind: TimeKind) ->
             f'{where}: `times="{kind}"` (`--times {kind}`): no numbers in the names are possible (expected '
             f"{expected}, different in each image of a camera, found {example}): pass another unit"
         )
-    is_likely: tuple[Callable[[Reading], bool], ...] = (lambda r: r.is_known_origin, lambda r: _has_rate(r.values))
     if kind == "index":
-        is_likely = (lambda r: all(np.median(each) <= LARGEST_STEP for each in _steps(r.values)),)
-    return next((reading for test in is_likely for reading in possible if test(reading)), possible[0])
-
-
-def _steps(values: Mapping[str, Times]) -> list[Times]:
-    """Of each camera with two or more images, the steps from one to the next."""
-    ordered = [np.sort(times) for times in values.values() if len(times) > 1]
-    return [times[1:] - times[:-1] for times in ordered]
-
-
-def _has_rate(values: Mapping[str, Times]) -> bool:
-    shortest, longest = PERIODS_NS
-    steps = _steps(values)
-    return bool(steps) and all(shortest <= np.median(camera_steps) <= longest for camera_steps in steps)
-
-
-def _is_steady(steps: list[Times]) -> bool:
-    """True where most steps are whole periods of the camera, more than one where an image was lost."""
-    for camera_steps in steps:
-        periods = camera_steps / np.median(camera_steps)
-        whole = np.maximum(np.round(periods), 1)
-        if (np.abs(periods - whole) <= JITTER).mean() < STEADY:
-            return False
-    return True
-
-
-def _extent(values: Mapping[str, Times]) -> int:
-    return int(max(times.max() for times in values.values()) - min(times.min() for times in values.values()))
-
-
-def _largest(reading: Reading) -> int:
-    return int(max(times.max() for times in reading.values.values()))
+        return min(possible, key=lambda each: any(np.median(steps) > LARGEST_STEP for steps in each.steps))
+    return min(possible, key=lambda each: (not each.is_known_origin, not each.has_rate))
 
 
 def listed_times(drive: Path, images: Path, numbers: Iterable[int]) -> tuple[dict[int, int], str] | None:
@@ -327,7 +305,7 @@ def read_times(file: Path) -> NDArray[np.int64]:
     for number, line in enumerate(read_text(file, CSV_BYTES).splitlines(), 1):
         if not (text := line.strip()):
             continue
-        time = date_ns(text) if ":" in text else scaled_ns(text)
+        time = date_ns(text) if ":" in text else scaled(text)
         if time is None or abs(time) > LARGEST_INTEGER or (times and time <= times[-1]):
             raise InputError(f'{file}: line {number}: expected a later time in seconds, or a date, found "{text:.40}"')
         times.append(time)
