@@ -6,7 +6,7 @@ and K and D in those beside it that `cam0_calib` names, of a lens of camodocal.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
 from bevcli.parsing.documents import read_json
 from bevcli.parsing.files import MIB, read_bytes, read_text
 from bevcli.sequences.files.json_fields import parse_numbers, require
-from bevcli.workshop.formats.camera_poses import Cameras, Direction, StatedCamera, StatedPose
+from bevcli.workshop.formats.camera_poses import Cameras, StatedCamera, StatedPose
 from bevcli.workshop.formats.markup import YAML_BYTES, read_yaml
 from bevcli.workshop.formats.named_calibration import (
     COEFFICIENTS,
@@ -32,6 +32,7 @@ from bevcli.workshop.formats.named_calibration import (
 LARGEST_TEXT = 64 * MIB
 NO_CAMERA = ("", ".", "images")  # folders that are not named after a camera
 SAME_FOCAL = 1.05  # ratio of focal lengths that a program finds for images of one camera
+Image = tuple[str, str, StatedCamera, Array]  # path, camera where the path names none, intrinsics, and pose (4, 4)
 PIXEL_CENTER = 0.5  # COLMAP and nerfstudio: coordinates of the centre of the top left pixel; 0 here
 # COLMAP's models: the number of focal lengths, the model of the lens, and the coefficients in the file's order.
 COLMAP_MODELS = {
@@ -45,12 +46,7 @@ COLMAP_MODELS = {
     "RADIAL_FISHEYE": (1, "kannala_brandt", "k1 k2"),
     "OPENCV_FISHEYE": (2, "kannala_brandt", "k1 k2 k3 k4"),
 }
-NERF_MODELS = {
-    "opencv": "plumb_bob",
-    "pinhole": "plumb_bob",
-    "simple_pinhole": "plumb_bob",
-    "opencv_fisheye": "fisheye",
-}
+NERF_MODELS = {**dict.fromkeys(("opencv", "pinhole", "simple_pinhole"), "plumb_bob"), "opencv_fisheye": "fisheye"}
 # VINS-Fusion's names of files, and the lens KANNALA_BRANDT of camodocal with the names here.
 VINS_CALIBRATION, VINS_LINE = re.compile(r"cam(\d+)_calib"), re.compile(rb"^cam\d+_calib\s*:", re.MULTILINE)
 KANNALA_BRANDT = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
@@ -61,9 +57,8 @@ def is_colmap(path: Path) -> bool:
     if not path.is_dir():
         return path.name == "cameras.txt"
     if _colmap_folder(path, "cameras.txt") is None and (folder := _colmap_folder(path, "cameras.bin")) is not None:
-        raise InputError(
-            f"{folder / 'cameras.bin'}: is binary: convert it (`colmap model_converter --output_type TXT …`)"
-        )
+        how = "convert it (`colmap model_converter --output_type TXT …`)"
+        raise InputError(f"{folder / 'cameras.bin'}: is binary: {how}")
     return _colmap_folder(path, "cameras.txt") is not None
 
 
@@ -83,37 +78,22 @@ def read_colmap(path: Path) -> Cameras:
         if words[0] in by_id:
             raise InputError(f"{where}: camera {words[0]:.60} is in the file twice: keep one")
         by_id[words[0]] = replace(_colmap_camera(words[1], numbers[2:], where), size=(numbers[0], numbers[1]))
-    poses, ids = dict[str, list[Array]](), dict[str, dict[str, None]]()
-    images = folder / "images.txt"
-    lines = list(lines_of(images, keep_empty=True)) if images.exists() else []
-    entries = [line.split(maxsplit=9) for _, line in lines[::2]]  # the other lines are points
-    camera_of = {words[9]: words[8] for words in entries if len(words) == 10}
-    names = _names_of_images(
-        {path: f"camera{key}" for path, key in camera_of.items()},
-        each_its_own=len(set(camera_of.values())) == len(camera_of) > 1,
-    )
-    for number, line in lines[::2]:
+    file, images = folder / "images.txt", list[Image]()
+    lines = list(lines_of(file, keep_empty=True)) if file.exists() else []
+    for number, line in lines[::2]:  # the other lines are points
         words = line.split(maxsplit=9)
         numbers = [number_of(word) for word in words[:8]]
         if len(words) < 10 or None in numbers or words[8] not in by_id:
-            raise InputError(f"{images}: line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
+            raise InputError(f"{file}: line {number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
         _, *pose_numbers = np.array(numbers, dtype=np.float64)
         pose = rigid(pose_numbers[4:], rotation_from_quaternion(pose_numbers[:4]))
-        name = names[words[9]]
-        poses.setdefault(name, []).append(pose)
-        ids.setdefault(name, {})[words[8]] = None
-    if not poses:
+        images.append((words[9], f"camera{words[8]}", by_id[words[8]], pose))
+    if not images:
         return {f"camera{key}": camera for key, camera in by_id.items()}
-    return {
-        name: _posed(
-            _one_camera([by_id[key] for key in ids[name]], f"{folder / 'cameras.txt'}: camera {name}"),
-            of_camera,
-            images.name,
-            "camera_from_ego",
-            "optical",
-        )
-        for name, of_camera in poses.items()
-    }
+    camera_of = {path: camera for path, camera, *_ in images}
+    each_its_own = len(set(camera_of.values())) == len(camera_of) > 1
+    pose = StatedPose({}, "camera_from_ego", axes="optical", name=file.name)
+    return _cameras_of_images(folder / "cameras.txt", images, pose, each_its_own=each_its_own)
 
 
 def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamera:
@@ -131,13 +111,6 @@ def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamer
     return StatedCamera(matrix, None, lens_fields(lens, coefficients, where))
 
 
-def _posed(camera: StatedCamera, poses: list[Array], name: str, direction: Direction, axes: str) -> StatedCamera:
-    """The camera with its pose, where the file has only one place of it."""
-    if any(not np.allclose(pose, poses[0], atol=1e-3) for pose in poses):
-        return replace(camera, moves=True)
-    return replace(camera, pose=StatedPose({"": poses[0]}, direction, axes=axes, name=name))
-
-
 def lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str]]:
     """Lines of a text with their numbers, without comments."""
     for number, line in enumerate(read_text(path, LARGEST_TEXT).splitlines(), 1):
@@ -145,26 +118,33 @@ def lines_of(path: Path, *, keep_empty: bool = False) -> Iterator[tuple[int, str
             yield number, line
 
 
-def _names_of_images(images: Mapping[str, str], *, each_its_own: bool) -> dict[str, str]:
-    """The camera of each image, by its path: its folder; without one, its name without a number.
+def _cameras_of_images(file: Path, images: Sequence[Image], pose: StatedPose, *, each_its_own: bool) -> Cameras:
+    """The cameras of images: by the folder of each; without one, by its name without a number.
 
-    images: path -> the camera where neither names one. each_its_own: each image has intrinsics of its own.
+    pose: without its matrix, which it has where a camera has only one place. each_its_own: each image has intrinsics of
+    its own.
     """
-    stems = {path: re.sub(r"[_. -]*\d+$", "", Path(path).stem) for path in images
+    stems = {path: re.sub(r"[_. -]*\d+$", "", Path(path).stem) for path, *_ in images
              if Path(path).parent.name in NO_CAMERA}  # fmt: skip
     are_cameras = each_its_own and all(stems.values()) and len(set(stems.values())) == len(stems)
-    other = stems if are_cameras else images
-    return {path: other[path] if path in stems else Path(path).parent.name for path in images}
+    groups: dict[str, list[tuple[StatedCamera, Array]]] = {}
+    for path, other, camera, matrix in images:
+        name = Path(path).parent.name if path not in stems else stems[path] if are_cameras else other
+        groups.setdefault(name, []).append((camera, matrix))
+    cameras: Cameras = {}
+    for name, group in groups.items():
+        camera = _one_camera(list({id(camera): camera for camera, _ in group}.values()), f"{file}: camera {name}")
+        first, moves = group[0][1], any(not np.allclose(matrix, group[0][1], atol=1e-3) for _, matrix in group)
+        cameras[name] = replace(camera, pose=None if moves else replace(pose, matrices={"": first}), moves=moves)
+    return cameras
 
 
 def _one_camera(cameras: list[StatedCamera], where: str) -> StatedCamera:
     """The camera whose images have intrinsics of their own: the median ones, where they are about equal."""
     matrices = np.array([camera.intrinsics for camera in cameras])
     focal = matrices[:, 0, 0]
-    if (
-        focal.max() > SAME_FOCAL * focal.min()
-        or len({str((each.distortion or {}).get("model")) for each in cameras}) > 1
-    ):
+    lenses = {str((camera.distortion or {}).get("model")) for camera in cameras}
+    if focal.max() > SAME_FOCAL * focal.min() or len(lenses) > 1:
         raise InputError(
             f"{where}: its images have focal lengths of {focal.min():.0f} to {focal.max():.0f} px: state one camera "
             "for each folder (COLMAP: --ImageReader.single_camera_per_folder 1), or put the images of each in a folder"
@@ -187,25 +167,15 @@ def read_nerfstudio(path: Path) -> Cameras:
     document = read_json(file)
     frames = document.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames) or not frames:
-        raise InputError(
-            f'{file}: "frames" is missing (expected a list of objects with file_path and transform_matrix)'
-        )
-    paths = [str(frame.get("file_path", "")) for frame in frames]
-    names = _names_of_images(dict.fromkeys(paths, "camera"), each_its_own=all("fl_x" in frame for frame in frames))
-    entries: dict[str, list[dict[str, Any]]] = {}
-    poses: dict[str, list[Array]] = {}
+        expected = "a list of objects with file_path and transform_matrix"
+        raise InputError(f'{file}: "frames" is missing (expected {expected})')
+    images = list[Image]()
     for index, frame in enumerate(frames):
-        name, where = names[paths[index]], f"{file}: frame {index}"
-        entries.setdefault(name, []).append({**document, **frame})
-        poses.setdefault(name, []).append(require(parse_numbers, frame, "transform_matrix", (4, 4), where=where))
-    made = {}
-    for name, of_camera in entries.items():
-        where = f"{file}: camera {name}"
-        made[name] = _one_camera([_nerf_camera(entry, where) for entry in of_camera], where)
-    return {
-        name: _posed(camera, poses[name], "transform_matrix", "ego_from_camera", "opengl")
-        for name, camera in made.items()
-    }
+        where = f"{file}: frame {index}"
+        matrix = require(parse_numbers, frame, "transform_matrix", (4, 4), where=where)
+        images.append((str(frame.get("file_path", "")), "camera", _nerf_camera({**document, **frame}, where), matrix))
+    pose = StatedPose({}, "ego_from_camera", axes="opengl", name="transform_matrix")
+    return _cameras_of_images(file, images, pose, each_its_own=all("fl_x" in frame for frame in frames))
 
 
 def _nerf_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
