@@ -65,6 +65,11 @@ def messages_of(native: Drive, motion: EgoMotion | None, **options) -> list[Mess
     return list(drive_messages(native, motion, **options))
 
 
+def with_info(messages: list[Message], info: dict) -> list[Message]:
+    """The messages with another CameraInfo of the front camera."""
+    return [(t, kind, time, info if t == "/CAM_FRONT/camera_info" else f) for t, kind, time, f in messages]
+
+
 def write(folder: Path, form: str, messages: list[Message]) -> Path:
     if form == "mcap":
         return write_mcap(folder / "bag.mcap", messages)
@@ -73,9 +78,7 @@ def write(folder: Path, form: str, messages: list[Message]) -> Path:
 
 @pytest.mark.parametrize("form", ["mcap", "rosbag2 sqlite3", "rosbag2 mcap"])
 @pytest.mark.parametrize("poses_in", ["odometry", "tf"])
-def test_a_bag_gives_the_frames_it_was_written_from(
-    tmp_path: Path, native: Drive, motion: EgoMotion, form: str, poses_in: str
-) -> None:
+def test_a_bag_gives_the_frames_it_was_written_from(tmp_path, native, motion, form, poses_in):
     sequence = open_sequence(write(tmp_path, form, messages_of(native, motion, poses_in=poses_in)))
     assert set(sequence.rig.names) == set(native.rig.names)
     for camera in native.rig.cameras:
@@ -94,7 +97,7 @@ def test_a_bag_gives_the_frames_it_was_written_from(
         np.testing.assert_allclose(found.kinematics.velocity, [10, 0, 0], atol=1e-6)
 
 
-def test_the_time_of_an_image_is_stated_not_that_of_recording(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_the_time_of_an_image_is_stated_not_that_of_recording(tmp_path, native, motion):
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion, delay_ns=180_000_000))
     sequence = open_sequence(path)
     times = [stamp.timestamp_ns for stamp in sequence.stamps]
@@ -102,9 +105,7 @@ def test_the_time_of_an_image_is_stated_not_that_of_recording(tmp_path: Path, na
     assert sequence.load(0).images["CAM_FRONT"].timestamp_ns == native.stamps[0].timestamp_ns
 
 
-def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
-    tmp_path: Path, native: Drive, motion: EgoMotion
-) -> None:
+def test_a_replayed_bag_with_changing_delays_keeps_stated_times(tmp_path, native, motion):
     messages = [
         (topic, kind, time + 3 * (time - 10**9), fields) for topic, kind, time, fields in messages_of(native, motion)
     ]
@@ -115,9 +116,7 @@ def test_a_replayed_bag_with_changing_delays_keeps_stated_times(
     )
 
 
-def test_opening_a_large_bag_reads_few_images(
-    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_opening_a_large_bag_reads_few_images(tmp_path, native, motion, monkeypatch):
     from bevcli.workshop.formats.ros.storage import McapFile
 
     monkeypatch.setattr("bevcli.workshop.formats.ros.vehicle.READ_WHOLE", 0)
@@ -140,9 +139,7 @@ def test_opening_a_large_bag_reads_few_images(
     assert len(set(read)) < 20
 
 
-def test_of_chunks_without_compression_messages_are_read(
-    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_chunks_without_compression_messages_are_read(tmp_path, native, motion, monkeypatch):
     from bevcli.workshop.formats.ros.storage import McapFile
 
     packed = open_sequence(write_mcap(tmp_path / "packed.mcap", messages_of(native, motion))).load(1)
@@ -155,9 +152,7 @@ def test_of_chunks_without_compression_messages_are_read(
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.999])
-def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
-    tmp_path: Path, native: Drive, motion: EgoMotion, share: float
-) -> None:
+def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path, native, motion, share):
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion), chunk_size=1_000)
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
@@ -170,7 +165,7 @@ def test_a_bag_that_was_cut_off_is_read_as_far_as_it_goes(
         assert any("is cut off" in note for note in sequence.notes)
 
 
-def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_file_without_a_message_says_which_topics_it_has(tmp_path, native, motion):
     others = [("/chatter", "std_msgs/String", 1, {"data": "hello"})]
     path = write_mcap(tmp_path / "bag.mcap", others)
     with pytest.raises(InputError, match=r"has no image topic \(topics: /chatter \(std_msgs/String\)\)"):
@@ -180,7 +175,7 @@ def test_a_file_without_a_message_says_which_topics_it_has(tmp_path: Path, nativ
         open_sequence(path)
 
 
-def test_missing_poses_and_extrinsics_are_named(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_missing_poses_and_extrinsics_are_named(tmp_path, native, motion):
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, None))
     with pytest.raises(InputError, match=r"has no poses of the vehicle.*/tf_static.*`--ego-motion FILE`"):
         open_sequence(path)
@@ -204,9 +199,7 @@ NO_POSES = {
 
 
 @pytest.mark.parametrize("poses_in", ["odometry", "tf"])
-def test_poses_that_are_none_are_left_out_with_their_number(
-    tmp_path: Path, native: Drive, motion: EgoMotion, poses_in: str
-) -> None:
+def test_poses_that_are_none_are_left_out_with_their_number(tmp_path, native, motion, poses_in):
     messages = messages_of(native, motion, poses_in=poses_in)
     topic = {"odometry": "/odom", "tf": "/tf"}[poses_in]
     of_topic = [place for place, message in enumerate(messages) if message[0] == topic]
@@ -224,7 +217,7 @@ def test_poses_that_are_none_are_left_out_with_their_number(
     )
 
 
-def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_broken_message_with_a_pose_is_left_out(tmp_path, native, motion):
     bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
     with contextlib.closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
         (number,) = database.execute("SELECT id FROM topics WHERE name = '/odom'").fetchone()
@@ -235,7 +228,7 @@ def test_a_broken_message_with_a_pose_is_left_out(tmp_path: Path, native: Drive,
     assert len(sequence.stamps) == 4
 
 
-def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_static_transform_counts_from_where_it_is_valid(tmp_path, native, motion):
     messages = messages_of(native, motion)
     bad = [transform(1, "base_link", f"{name}_optical", NO_POSES["zero"]) for name in native.rig.names]
     early = [("/tf_static", "tf2_msgs/TFMessage", time, {"transforms": bad}) for time in range(1, 300)]
@@ -246,7 +239,7 @@ def test_a_static_transform_counts_from_where_it_is_valid(tmp_path: Path, native
     assert any("/tf_static: 598 of 600 poses are left out" in note for note in sequence.notes)
 
 
-def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_link_without_any_valid_pose_is_an_error(tmp_path, native, motion):
     messages = [message for message in messages_of(native, motion) if message[0] != "/odom"]
     bad = [
         ("/odom", "nav_msgs/Odometry", time, odometry(time, "map", "base_link", NO_POSES["NaN"]))
@@ -256,7 +249,7 @@ def test_a_link_without_any_valid_pose_is_an_error(tmp_path: Path, native: Drive
         open_sequence(write_mcap(tmp_path / "bag.mcap", messages + bad))
 
 
-def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path, native, motion):
     messages = messages_of(native, motion)
     for time, zero in enumerate((0.0, np.nan), start=1):
         unset = {**camera_info(native.rig["CAM_FRONT"], time, ""), "k": [zero] * 9}
@@ -266,30 +259,21 @@ def test_a_camera_is_calibrated_from_where_its_k_is_set(tmp_path: Path, native: 
 
 
 @pytest.mark.parametrize(("k", "size", "message"), [(0.01, 64, "implausible focal length"), (50, 0, "image size")])
-def test_a_camera_that_no_calibration_may_hold_is_refused(
-    tmp_path: Path, native: Drive, motion: EgoMotion, k: float, size: int, message: str
-) -> None:
+def test_a_camera_that_no_calibration_may_hold_is_refused(tmp_path, native, motion, k, size, message):
     info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
     info |= {"width": size, "k": [k, 0.0, 32, 0, 50.0, 18, 0, 0, 1]}
-    messages = [
-        (t, kind, time, info if t == "/CAM_FRONT/camera_info" else f)
-        for t, kind, time, f in messages_of(native, motion)
-    ]
+    messages = with_info(messages_of(native, motion), info)
     with pytest.raises(InputError, match=rf"/CAM_FRONT/camera_info.*CAM_FRONT.*{message}"):
         open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
 
 
 @pytest.mark.parametrize("rectified", [False, True])
-def test_the_intrinsics_are_those_of_the_region_of_interest(
-    tmp_path: Path, native: Drive, motion: EgoMotion, rectified: bool
-) -> None:
+def test_the_intrinsics_are_those_of_the_region_of_interest(tmp_path, native, motion, rectified):
     info = camera_info(native.rig["CAM_FRONT"], 10**9, "CAM_FRONT_optical")
     info |= {"width": 200, "height": 100, "k": [80.0, 0, 100, 0, 80, 50, 0, 0, 1], "binning_x": 2, "binning_y": 2}
     info |= {"p": [80.0, 0, 100, 0, 0, 80, 50, 0, 0, 0, 1, 0]}
     info["roi"] = {"x_offset": 40, "y_offset": 10, "width": 128, "height": 64, "do_rectify": False}
-    messages = [
-        (t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages_of(native, motion)
-    ]
+    messages = with_info(messages_of(native, motion), info)
     if rectified:
         messages = renamed(messages, {"/CAM_FRONT/image/compressed": "/CAM_FRONT/image_rect/compressed"})
     camera = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).rig["CAM_FRONT"]
@@ -299,9 +283,7 @@ def test_the_intrinsics_are_those_of_the_region_of_interest(
 
 
 @pytest.mark.parametrize("topic", ["/CAM_FRONT/image/compressed", "/CAM_BACK/image/compressed", "/odom"])
-def test_messages_in_any_order_give_the_same_frames(
-    tmp_path: Path, native: Drive, motion: EgoMotion, topic: str
-) -> None:
+def test_messages_in_any_order_give_the_same_frames(tmp_path, native, motion, topic):
     messages = messages_of(native, motion)
     times = [time for name, _, time, _ in messages if name == topic]
     shuffled = iter(np.random.default_rng(0).permutation(times).tolist())
@@ -318,9 +300,7 @@ def test_messages_in_any_order_give_the_same_frames(
             )
 
 
-def test_files_beside_the_bag_replace_its_calibration_and_poses(
-    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
-) -> None:
+def test_files_beside_the_bag_replace_its_calibration_and_poses(tmp_path, drive, native, motion):
     messages = [message for message in messages_of(native, None) if "image" in message[0]]
     path = write_mcap(tmp_path / "bag.mcap", messages)
     given = {"calibration": drive / "calibration.json", "ego_motion_file": drive / "ego_motion.csv"}
@@ -350,7 +330,7 @@ AUTOWARE = {
 }
 
 
-def test_autoware_topics_are_found(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_autoware_topics_are_found(tmp_path, native, motion):
     messages = renamed(messages_of(native, motion), AUTOWARE)
     wrong = [("/sensing/gnss/pose", "geometry_msgs/PoseStamped", 1, pose_stamped(1))]
     path = write_mcap(tmp_path / "bag.mcap", messages + wrong)
@@ -366,7 +346,7 @@ def pose_stamped(time: int) -> dict:
     return {"header": header(time, "map"), "pose": pose}
 
 
-def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_topics_file_states_cameras_frames_and_poses(tmp_path, native, motion):
     names = {
         "/CAM_FRONT/image/compressed": "/a/first",
         "/CAM_FRONT/camera_info": "/b/one",
@@ -392,9 +372,7 @@ def test_a_topics_file_states_cameras_frames_and_poses(tmp_path: Path, native: D
         open_sequence(path, topics={"CAM_FRONT": "/nothing"})
 
 
-def test_a_calibration_with_cameras_not_found_names_the_option(
-    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
-) -> None:
+def test_a_calibration_with_cameras_not_found_names_the_option(tmp_path, drive, native, motion):
     path = write_mcap(tmp_path / "bag.mcap", renamed(messages_of(native, motion), AUTOWARE))
     with pytest.raises(InputError, match=r"camera CAM_FRONT of the calibration.*`topics=\{'CAM_FRONT': '/TOPIC'\}`"):
         open_sequence(path, calibration=drive / "calibration.json")
@@ -403,16 +381,14 @@ def test_a_calibration_with_cameras_not_found_names_the_option(
     assert sequence.rig.names == native.rig.names
 
 
-def test_cameras_of_a_calibration_without_a_topic_are_left_out(
-    tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion
-) -> None:
+def test_cameras_of_a_calibration_without_a_topic_are_left_out(tmp_path, drive, native, motion):
     messages = [message for message in messages_of(native, motion) if "CAM_BACK" not in message[0]]
     sequence = open_sequence(write(tmp_path, "mcap", messages), calibration=drive / "calibration.json")
     assert sequence.rig.names == ("CAM_FRONT",)
     assert "without images, left out: CAM_BACK" in sequence.notes
 
 
-def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_frames_before_the_first_pose_are_left_out(tmp_path, native, motion):
     late = 1_400_000_000
     messages = [m for m in messages_of(native, motion) if m[0] != "/odom" or m[2] >= late]
     sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
@@ -420,7 +396,7 @@ def test_frames_before_the_first_pose_are_left_out(tmp_path: Path, native: Drive
     assert any("1 of 4 frames are left out" in note for note in sequence.notes)
 
 
-def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path, native, motion):
     base_from_imu = Pose.from_matrix(np.eye(4))
     base_from_imu = replace(base_from_imu, translation=np.array([1.0, 2.0, 3.0]))
     messages = [m for m in messages_of(native, None) if m[0] != "/odom"]
@@ -439,7 +415,7 @@ def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path: Path, na
     )
 
 
-def test_a_chain_of_moving_transforms_is_multiplied(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_chain_of_moving_transforms_is_multiplied(tmp_path, native, motion):
     map_from_odom = Pose(np.array([5.0, 0.0, 0.0]), Pose.from_matrix(np.eye(4)).quaternion)
     messages = messages_of(native, None)
     for time in motion.timestamps_ns.tolist():
@@ -465,26 +441,24 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_the_distortion_models_of_camera_info(tmp_path: Path, native: Drive, motion: EgoMotion, model: str) -> None:
+def test_the_distortion_models_of_camera_info(tmp_path, native, motion, model):
     camera = replace(native.rig["CAM_FRONT"], distortion=LENSES[model])
     info = camera_info(camera, 10**9, "CAM_FRONT_optical")
     assert info["distortion_model"] == model
-    messages = [
-        (t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages_of(native, motion)
-    ]
+    messages = with_info(messages_of(native, motion), info)
     sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages))
     assert sequence.rig["CAM_FRONT"].distortion == LENSES[model]
     assert sequence.rig["CAM_BACK"].distortion is None
 
 
-def test_a_rectified_image_has_the_rectifications_intrinsics(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_rectified_image_has_the_rectifications_intrinsics(tmp_path, native, motion):
     camera = replace(native.rig["CAM_FRONT"], distortion=LENSES["plumb_bob"])
     info = camera_info(camera, 10**9, "CAM_FRONT_optical")
     projection = np.array([[40.0, 0, 30, 0], [0, 41, 16, 0], [0, 0, 1, 0]])
     rotation = rotation_about_z(0.1)
     info |= {"p": projection.ravel().tolist(), "r": rotation.ravel().tolist()}
     messages = renamed(messages_of(native, motion), {"/CAM_FRONT/image/compressed": "/CAM_FRONT/image_rect/compressed"})
-    messages = [(t, k, time, info if t == "/CAM_FRONT/camera_info" else f) for t, k, time, f in messages]
+    messages = with_info(messages, info)
     found = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).rig["CAM_FRONT"]
     assert found.distortion is None
     np.testing.assert_array_equal(found.intrinsics, projection[:, :3])
@@ -510,7 +484,7 @@ def encode(pixels: np.ndarray, encoding: str) -> tuple[np.ndarray, int]:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgb8", "bgra8", "mono8"])
-def test_raw_images(tmp_path: Path, native: Drive, motion: EgoMotion, encoding: str) -> None:
+def test_raw_images(tmp_path, native, motion, encoding):
     messages = raw_messages(native, motion, lambda pixels: encode(pixels, encoding), encoding)
     frame = open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(1)
     for name, image in native.load(1).images.items():
@@ -536,9 +510,7 @@ def raw_messages(native: Drive, motion: EgoMotion, encoded, encoding: str) -> li
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_image_of_one_colour_has_that_colour(
-    tmp_path: Path, native: Drive, motion: EgoMotion, pattern: str
-) -> None:
+def test_a_bayer_image_of_one_colour_has_that_colour(tmp_path, native, motion, pattern):
     levels = {"r": 200, "g": 120, "b": 40}
 
     def mosaic(pixels: np.ndarray) -> tuple[np.ndarray, int]:
@@ -552,9 +524,7 @@ def test_a_bayer_image_of_one_colour_has_that_colour(
     np.testing.assert_array_equal(image.pixels_bgr[10, 10], [40, 120, 200])
 
 
-def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(
-    tmp_path: Path, native: Drive, motion: EgoMotion
-) -> None:
+def test_an_unknown_encoding_is_an_error_a_broken_image_is_a_gap(tmp_path, native, motion):
     messages = raw_messages(native, motion, lambda pixels: encode(pixels, "bgr8"), "32FC1")
     with pytest.raises(InputError, match="encoding 32FC1 is not supported"):
         open_sequence(write_mcap(tmp_path / "bag.mcap", messages)).load(0)
@@ -591,7 +561,7 @@ def encoded_as(suffix: str, pixels: np.ndarray) -> bytes:
     return cv2.imencode(suffix, pixels, quality)[1].tobytes()
 
 
-def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Drive) -> None:
+def test_compressed_images_that_opencv_reads(tmp_path, native):
     pixels = np.random.default_rng(0).integers(0, 255, (36, 64, 3), dtype=np.uint8)  # OpenCV's WebP is without loss
     images = [(f"bgr8; {kind} compressed bgr8", encoded_as(f".{kind}", pixels)) for kind in ("webp", "tiff", "bmp")]
     images.append(("rgb8; png compressed rgb8", encoded_as(".png", pixels[..., ::-1])))
@@ -600,7 +570,7 @@ def test_compressed_images_that_opencv_reads(tmp_path: Path, native: Drive) -> N
         assert image.encoded is None  # other files are not handed on
 
 
-def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: Drive) -> None:
+def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path, native):
     tile = np.array([[200, 120], [120, 40]])  # red top left
     small, wide = (np.tile(tile << shift, (18, 32)).astype(kind) for shift, kind in ((0, np.uint8), (8, np.uint16)))
     coloured = np.full((36, 64, 3), (40, 120, 200), dtype=np.uint8)
@@ -614,7 +584,7 @@ def test_a_compressed_bayer_pattern_is_shown_in_colour(tmp_path: Path, native: D
         np.testing.assert_allclose(image.pixels_bgr[10, 10].astype(int), [40, 120, 200], atol=4)
 
 
-def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path: Path, native: Drive) -> None:
+def test_a_compressed_format_that_is_not_read_is_one_error(tmp_path, native):
     path = compressed_bag(tmp_path, native, [("h264", b"\0\0\0\1" * 20)])
     with pytest.raises(
         InputError, match=r"/CAM_BACK/image/compressed: images of format h264 are not read \(expected JP"
@@ -681,7 +651,7 @@ def foxglove_files():
 
 
 @pytest.mark.parametrize("form", ["json", "protobuf"])
-def test_foxglove_schemas(tmp_path: Path, native: Drive, motion: EgoMotion, form: str) -> None:
+def test_foxglove_schemas(tmp_path, native, motion, form):
     path = tmp_path / "bag.mcap"
     if form == "json":
         write_json_mcap(path, foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9}))
@@ -697,7 +667,7 @@ def test_foxglove_schemas(tmp_path: Path, native: Drive, motion: EgoMotion, form
 
 
 @pytest.mark.parametrize("schema", ["foxglove.FrameTransforms", "foxglove.CompressedImage"])
-def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path: Path, native, motion, schema: str) -> None:
+def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path, native, motion, schema):
     messages = foxglove_messages(native, motion, lambda t: {"sec": t // 10**9, "nsec": t % 10**9})
     kind, place = next((one[1], i) for i, one in enumerate(messages) if one[1] == schema and one[0] != "/tf_static")
     topic, _, time, fields = messages[place]
@@ -709,7 +679,7 @@ def test_a_time_beyond_64_bits_is_that_of_recording(tmp_path: Path, native, moti
     assert found.load(0).images["CAM_BACK"].timestamp_ns == native.load(0).images["CAM_BACK"].timestamp_ns
 
 
-def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Drive, motion: EgoMotion) -> None:
+def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path, native, motion):
     bag = write_rosbag2(tmp_path / "bag", messages_of(native, motion))
     (bag / "metadata.yaml").unlink()  # a recording that was cut off has none
     assert len(open_sequence(bag).stamps) == 4
@@ -722,7 +692,7 @@ def test_a_folder_without_metadata_and_a_ros1_bag(tmp_path: Path, native: Drive,
 
 
 @pytest.mark.parametrize("name", ["drive.mcap.zst", "drive.db3.gz", "folder"])
-def test_a_packed_bag_is_named_with_the_remedy(tmp_path: Path, name: str) -> None:
+def test_a_packed_bag_is_named_with_the_remedy(tmp_path, name):
     path = tmp_path / name
     path.mkdir() if name == "folder" else path.write_bytes(b"packed")
     if name == "folder":
@@ -731,7 +701,7 @@ def test_a_packed_bag_is_named_with_the_remedy(tmp_path: Path, name: str) -> Non
         open_sequence(path)
 
 
-def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path: Path) -> None:
+def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path):
     path = write_encoded(
         tmp_path / "old.mcap",
         [("/cam/image", "sensor_msgs/CompressedImage", 1, {}), ("/cam/camera_info", "sensor_msgs/CameraInfo", 1, {})],
@@ -741,7 +711,7 @@ def test_messages_of_ros_1_in_an_mcap_are_named_with_the_remedy(tmp_path: Path) 
         open_sequence(path)
 
 
-def test_options_for_other_inputs_are_refused(tmp_path: Path, drive: Path, native: Drive, motion: EgoMotion) -> None:
+def test_options_for_other_inputs_are_refused(tmp_path, drive, native, motion):
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
     with pytest.raises(InputError, match='has no scene "one"'):
         open_sequence(path, scene="one")
@@ -753,10 +723,7 @@ def video_bag(folder: Path, native: Drive, packets: list[bytes], video_format: s
     """The small drive with CAM_FRONT as a video of ten images per second."""
     messages = [m for m in messages_of(native, None) if m[0] != "/CAM_FRONT/image/compressed"]
     camera = replace(native.rig["CAM_FRONT"], width=64, height=48)
-    messages = [
-        (t, k, time, camera_info(camera, time, "CAM_FRONT_optical") if t == "/CAM_FRONT/camera_info" else fields)
-        for t, k, time, fields in messages
-    ]
+    messages = with_info(messages, camera_info(camera, 10**9, "CAM_FRONT_optical"))
     for number, packet in enumerate(packets):
         time = 10**9 + number * 100_000_000
         timestamp = {"sec": time // 10**9, "nanosec": time % 10**9}
@@ -766,7 +733,7 @@ def video_bag(folder: Path, native: Drive, packets: list[bytes], video_format: s
 
 
 @pytest.mark.parametrize("video_format", ["h264", "h265"])
-def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Drive, video_format: str) -> None:
+def test_video_packets_are_decoded_in_any_order(tmp_path, native, video_format):
     stored = json.loads((Path(__file__).parents[1] / "data/video_packets.json").read_text())
     packets = [base64.b64decode(text) for text in stored[video_format]]
     sequence = open_sequence(video_bag(tmp_path, native, packets, video_format), ego_motion="static")
@@ -777,15 +744,13 @@ def test_video_packets_are_decoded_in_any_order(tmp_path: Path, native: Drive, v
         assert image.pixels_bgr.mean() == pytest.approx(10 + 20 * 5 * place, abs=5)
 
 
-def test_an_unknown_video_format_is_an_error(tmp_path: Path, native: Drive) -> None:
+def test_an_unknown_video_format_is_an_error(tmp_path, native):
     path = video_bag(tmp_path, native, [b"abc"], "theora")
     with pytest.raises(InputError, match="video format theora is not supported"):
         open_sequence(path, ego_motion="static")
 
 
-def test_without_the_extra_the_error_names_it(
-    tmp_path: Path, native: Drive, motion: EgoMotion, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_extra_the_error_names_it(tmp_path, native, motion, monkeypatch):
     path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
     monkeypatch.setattr("bevcli.workshop.formats.BAG_PACKAGES", ("rosbags", "a_package.that_is_missing"))
     with pytest.raises(InputError, match=r"run pip install 'bevcli\[ros\]'"):

@@ -1,7 +1,5 @@
 """`export`: write the boxes of a run, a boxes file or a recording in another format."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,31 +15,11 @@ from bevcli.workshop.formats import ExportOptions
 from bevcli.workshop.formats.kitti import export_kitti
 from bevcli.writing import check_output
 
-
-@dataclass(frozen=True)
-class BoxFormat:
-    """A format that boxes are exported in.
-
-    Attributes:
-        target: name of the file or folder that is written next to the boxes by default.
-        write: writes boxes to a path with the options of the export, given the file that the boxes are from, and
-            returns what it wrote, such as "20 frames, 3 tracks". Raises InputError for boxes that the format cannot
-            hold, and OutputError.
-    """
-
-    target: str
-    write: Callable[[BoxesFile, Path, ExportOptions, Path], str]
-
-
-BOX_FORMATS = {
-    "csv": BoxFormat("boxes.csv", lambda boxes, to, *_: counted(write_csv(boxes, to), "boxes")),
-    "json": BoxFormat("boxes.json", lambda boxes, to, *_: counted(write_boxes(boxes, to), "boxes")),
-    "kitti": BoxFormat("kitti", export_kitti),
-    "nuscenes": BoxFormat("results_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to), "samples")),
-    "nuscenes-tracking": BoxFormat(
-        "tracking_nusc.json", lambda boxes, to, *_: counted(write_submission(boxes, to, tracking=True), "samples")
-    ),
-}
+# Format -> the name of the file or folder that is written next to the boxes by default.
+TARGETS = {
+    "csv": "boxes.csv", "json": "boxes.json", "kitti": "kitti", "nuscenes": "results_nusc.json",
+    "nuscenes-tracking": "tracking_nusc.json",
+}  # fmt: skip
 
 
 def export(predictions: str | Path, options: ExportOptions | None = None, **changes: Any) -> tuple[Path, str]:
@@ -66,14 +44,13 @@ def export(predictions: str | Path, options: ExportOptions | None = None, **chan
 
 def export_boxes(predictions: Path, options: ExportOptions) -> tuple[Path, str, str]:
     """Write boxes, see `export`: the file, what was written, and a note where a recording is incomplete, or ""."""
-    if options.form not in BOX_FORMATS:
-        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(BOX_FORMATS)})")
-    form = BOX_FORMATS[options.form]
+    if options.form not in TARGETS:
+        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(TARGETS)})")
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
-    target = options.out or file.parent / form.target
+    target = options.out or file.parent / TARGETS[options.form]
     check_output(target, file)
     boxes, note = _boxes_of(file)
-    return target, form.write(above_score(boxes, options.score), target, options, file), note
+    return target, _write(above_score(boxes, options.score), target, options, file), note
 
 
 def _boxes_of(file: Path) -> tuple[BoxesFile, str]:
@@ -83,3 +60,12 @@ def _boxes_of(file: Path) -> tuple[BoxesFile, str]:
     with open_recording(file) as whole:
         note = "" if whole == file else f"{file} is incomplete (its run was stopped or is still going)"
         return read_recording(whole), note
+
+
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
+    """Write boxes of a file, and say what, such as "20 frames, 3 tracks"."""
+    if options.form == "kitti":
+        return export_kitti(boxes, target, options, source)
+    if options.form in ("csv", "json"):
+        return counted((write_csv if options.form == "csv" else write_boxes)(boxes, target), "boxes")
+    return counted(write_submission(boxes, target, tracking=options.form == "nuscenes-tracking"), "samples")

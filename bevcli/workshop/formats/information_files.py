@@ -47,12 +47,10 @@ def is_information(path: Path) -> bool:
 
 def read_information(path: Path) -> Cameras:
     """The cameras of an information file, whose entries must have one rig. Raises InputError."""
-    document = _document(path)
-    entries = (
-        next((document[name] for name in LISTS if name in document), document)
-        if isinstance(document, dict)
-        else document
-    )
+    is_pickle = path.suffix.lower() in PICKLES
+    entries = read_plain_pickle(path) if is_pickle else read_json(path, largest=LARGEST_BYTES)
+    if isinstance(entries, dict):
+        entries = next((entries[name] for name in LISTS if name in entries), entries)
     entries = entries if isinstance(entries, list) else [entries]
     rigs = [_cameras(entry, f"{path}: entry {index}") for index, entry in enumerate(entries)]
     if not rigs:
@@ -61,10 +59,6 @@ def read_information(path: Path) -> Cameras:
         if rig.keys() != rigs[0].keys() or any(_differ(rig[name], rigs[0][name]) for name in rig):
             raise InputError(f"{path}: entry {index} has another rig than entry 0: keep those of this drive")
     return cameras_of(rigs[0], path)
-
-
-def _document(path: Path) -> Any:
-    return read_plain_pickle(path) if path.suffix.lower() in PICKLES else read_json(path, largest=LARGEST_BYTES)
 
 
 def _differ(camera: dict[str, Any], other: dict[str, Any]) -> bool:
@@ -79,27 +73,23 @@ def _cameras(entry: Any, where: str) -> dict[str, dict[str, Any]]:
         raise InputError(f'{where}: has no cameras (expected "cams" or "images" with one object for each camera)')
     points = entry.get("lidar_points")
     lidar = {**entry, **points} if isinstance(points, dict) else entry
-    ego_from_lidar = _transform(lidar, "lidar2ego", where)
+    ego_from_lidar = _transform(lidar, where, "lidar2ego")
     return {str(name): _camera(camera, ego_from_lidar, f"{where}: camera {name}") for name, camera in cameras.items()}
 
 
 def _camera(camera: dict[str, Any], ego_from_lidar: Array | None, where: str) -> dict[str, Any]:
     """The names and values of a camera that `cameras_of` reads."""
-    image_from_lidar = _matrix(camera, "lidar2img", where)
-    intrinsics = next(
-        (matrix for name in ("cam_intrinsic", "cam2img") if (matrix := _matrix(camera, name, where)) is not None), None
-    )
-    lidar_from_camera = _transform(camera, "sensor2lidar", where)
-    if (camera_from_lidar := _matrix(camera, "lidar2cam", where)) is not None:
+    image_from_lidar, camera_from_lidar = (_transform(camera, where, name) for name in ("lidar2img", "lidar2cam"))
+    intrinsics = _transform(camera, where, "cam_intrinsic", "cam2img")
+    ego_from_camera = _transform(camera, where, "sensor2ego", "cam2ego")
+    lidar_from_camera = _transform(camera, where, "sensor2lidar")
+    if camera_from_lidar is not None:
         lidar_from_camera = inverse(camera_from_lidar)
     if image_from_lidar is not None and (intrinsics is None or lidar_from_camera is None):
         intrinsics, lidar_from_camera = _split(image_from_lidar)
-    ego_from_camera = _transform(camera, "sensor2ego", where)
-    ego_from_camera = _matrix(camera, "cam2ego", where) if ego_from_camera is None else ego_from_camera
     if intrinsics is None:
         raise InputError(f"{where}: has no intrinsics (expected cam_intrinsic, cam2img or lidar2img)")
-    made: dict[str, Any] = {"K": intrinsics[:3, :3].tolist()}
-    made |= {key: camera[key] for key in ("width", "height") if key in camera}
+    made = {"K": intrinsics[:3, :3].tolist(), **{key: camera[key] for key in ("width", "height") if key in camera}}
     if ego_from_camera is None and lidar_from_camera is not None and ego_from_lidar is not None:
         ego_from_camera = ego_from_lidar @ lidar_from_camera
     if ego_from_camera is not None:
@@ -107,29 +97,24 @@ def _camera(camera: dict[str, Any], ego_from_lidar: Array | None, where: str) ->
     return made if lidar_from_camera is None else made | {"lidar2cam": inverse(lidar_from_camera).tolist()}
 
 
-def _transform(owner: dict[str, Any], name: str, where: str) -> Array | None:
-    """(4, 4) of NAME, or of NAME_rotation and NAME_translation; None where there is neither."""
-    if owner.get(name) is not None:
-        return _matrix(owner, name, where)
-    rotation, translation = (array_of_numbers(owner.get(f"{name}_{part}")) for part in ("rotation", "translation"))
-    if rotation is None or translation is None:
-        return None
-    if rotation.size not in (4, 9) or translation.size != 3:
-        raise InputError(f"{where}: {name}_rotation: expected w, x, y, z or 3x3 numbers, and three of a translation")
-    turned = rotation_from_quaternion(rotation.ravel()) if rotation.size == 4 else rotation.reshape(3, 3)
-    return rigid(translation.ravel(), turned)
-
-
-def _matrix(owner: dict[str, Any], name: str, where: str) -> Array | None:
-    """(4, 4) of 3x3, 3x4 or 4x4 numbers; None where there are none."""
-    if owner.get(name) is None:
-        return None
-    numbers = array_of_numbers(owner[name])
-    if numbers is None or numbers.shape not in ((3, 3), (3, 4), (4, 4)) or not np.isfinite(numbers).all():
-        raise InputError(f"{where}: {name}: expected 3x3 or 4x4 finite numbers")
-    matrix = np.eye(4)
-    matrix[: numbers.shape[0], : numbers.shape[1]] = numbers
-    return matrix
+def _transform(owner: dict[str, Any], where: str, *names: str) -> Array | None:
+    """(4, 4) of the first NAME, 3x3 to 4x4 numbers, or NAME_rotation and NAME_translation; None where there is none."""
+    for name in names:
+        if owner.get(name) is not None:
+            numbers = array_of_numbers(owner[name])
+            if numbers is None or numbers.shape not in ((3, 3), (3, 4), (4, 4)) or not np.isfinite(numbers).all():
+                raise InputError(f"{where}: {name}: expected 3x3 or 4x4 finite numbers")
+            matrix = np.eye(4)
+            matrix[: numbers.shape[0], : numbers.shape[1]] = numbers
+            return matrix
+        rotation, translation = (array_of_numbers(owner.get(f"{name}_{key}")) for key in ("rotation", "translation"))
+        if rotation is not None and translation is not None:
+            if rotation.size not in (4, 9) or translation.size != 3:
+                expected = "w, x, y, z or 3x3 numbers, and three of a translation"
+                raise InputError(f"{where}: {name}_rotation: expected {expected}")
+            turned = rotation_from_quaternion(rotation.ravel()) if rotation.size == 4 else rotation.reshape(3, 3)
+            return rigid(translation.ravel(), turned)
+    return None
 
 
 def _split(image_from_lidar: Array) -> tuple[Array, Array]:

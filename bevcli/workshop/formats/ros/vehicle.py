@@ -98,35 +98,16 @@ def invalid_note(source: str, are_valid: list[bool]) -> list[str]:
     return [f"{source}: {invalid} of {len(are_valid)} poses are left out: {reason}"] if invalid else []
 
 
-def motion_from_poses(bag: Bag, topic: str, child_from_ego: Array | None) -> tuple[EgoMotion, list[str]]:
-    """Poses of a topic with Odometry or poses, and notes. child_from_ego: (4, 4), None: the poses are the vehicle's."""
-    return _motion_from(bag, [topic], [topic], None, child_from_ego)
-
-
-def motion_from_transforms(
+def read_motion(
     bag: Bag, topics: Sequence[str], frames: Sequence[str], child_from_ego: Array | None
 ) -> tuple[EgoMotion, list[str]]:
-    """Poses along a chain of transforms, and notes. topics: with transforms that change.
+    """The poses of the vehicle in topics, and notes: of Odometry or poses, or along a chain of transforms.
 
-    frames: the frame of the world first, each the parent of the next. child_from_ego: (4, 4) from the last of them to
-    the ego vehicle, None if they are the same.
+    frames: of the chain, that of the world first, each the parent of the next; none for a topic with poses.
+    child_from_ego: (4, 4) from the last of them, or what has the poses, to the vehicle; None if they are the same.
     """
-    links = [f"{parent} to {child}" for parent, child in pairwise(frames)]
-    by_child = dict(zip(frames[1:], links, strict=True))
-    return _motion_from(bag, topics, links, by_child, child_from_ego)
-
-
-def _motion_from(
-    bag: Bag,
-    topics: Sequence[str],
-    links: Sequence[str],
-    by_child: Mapping[str, str] | None,
-    child_from_ego: Array | None,
-) -> tuple[EgoMotion, list[str]]:
-    """Poses along links, which are multiplied, and notes.
-
-    by_child: child frame of a transform -> its link; None where all are of the single link.
-    """
+    by_child = {child: f"{parent} to {child}" for parent, child in pairwise(frames)}
+    links = [*by_child.values()] or [*topics]
     samples: dict[str, dict[int, Pose]] = {link: {} for link in links}
     are_valid: list[bool] = []
     for time, topic, number in _in_order(bag, {topic: range(len(bag.times(topic))) for topic in topics}):
@@ -136,7 +117,7 @@ def _motion_from(
             are_valid.append(False)
             continue
         for transform in transforms:
-            link = links[0] if by_child is None else by_child.get(transform.child)
+            link = by_child.get(transform.child) if frames else links[0]
             if link is None:
                 continue
             are_valid.append(transform.parent_from_child is not None)
@@ -330,13 +311,13 @@ class VehicleReader:
             is_other = child not in ("", ego_frame)
             child_from_ego = self._tree.between(child, ego_frame) if is_other else None
             note = f'{topic} has poses of "{child}", which are taken as those of "{ego_frame}"'
-            motion, notes = motion_from_poses(self._bag, topic, child_from_ego)
+            motion, notes = read_motion(self._bag, [topic], [], child_from_ego)
             return motion, topic, (*([note] if is_other and child_from_ego is None else ()), *notes)
         path = self._moving_path(ego_frame)
         if len(path) > 1:
             changing = [name for name in self._finder.of_kind("transforms") if not is_static(name)]
             child_from_ego = None if path[0] == ego_frame else self._tree.between(path[0], ego_frame)
-            motion, notes = motion_from_transforms(self._bag, changing, path[::-1], child_from_ego)
+            motion, notes = read_motion(self._bag, changing, path[::-1], child_from_ego)
             return motion, changing[0], tuple(notes)
         if use == "required":
             raise InputError(
