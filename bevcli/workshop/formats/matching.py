@@ -44,23 +44,6 @@ class CameraImages:
         return indices, np.abs(self.times_ns[indices] - times_ns) <= FARTHEST * self.period_ns
 
 
-@dataclass(frozen=True)
-class Matched:
-    """The frames of cameras.
-
-    Attributes:
-        entries: the frames.
-        leading: the camera that sets them.
-        farthest_ns: the largest time between a frame and one of its images.
-        missing: number of images that frames lack.
-    """
-
-    entries: tuple[FrameEntry, ...]
-    leading: str
-    farthest_ns: int
-    missing: int
-
-
 def measured_periods(times: Mapping[str, NDArray[np.int64]]) -> dict[str, float]:
     """The period of each camera, ns: the median of its steps, and that of all cameras where these are about equal."""
     steps = {camera: np.diff(np.sort(stamps)) for camera, stamps in times.items() if len(stamps) > 1}
@@ -71,15 +54,13 @@ def measured_periods(times: Mapping[str, NDArray[np.int64]]) -> dict[str, float]
     return {camera: common if abs(period / common - 1) < SAME_RATE else period for camera, period in periods.items()}
 
 
-def match(cameras: Mapping[str, CameraImages]) -> Matched:
-    """One frame for each image of the camera with the lowest rate, the first of equal ones.
+def match(cameras: Mapping[str, CameraImages]) -> tuple[str, tuple[FrameEntry, ...]]:
+    """The camera with the lowest rate, the first of equal ones, and a frame for each of its images.
 
     Where this camera lost images, the frames have those of the others.
     """
     leading, slowest = max(cameras.items(), key=lambda item: item[1].period_ns)
-    entries = frames_at(_without_gaps(slowest), cameras, leading)
-    apart = (source.timestamp_ns - entry.stamp.timestamp_ns for entry in entries for source in entry.sources.values())
-    return Matched(entries, leading, max(map(abs, apart), default=0), sum(len(entry.dropped) for entry in entries))
+    return leading, frames_at(_without_gaps(slowest), cameras, leading)
 
 
 def frames_at(times_ns: NDArray[np.int64], cameras: Mapping[str, CameraImages], leading: str) -> tuple[FrameEntry, ...]:

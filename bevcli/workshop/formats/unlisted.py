@@ -9,7 +9,7 @@ offset_ns = 25000000             # its first image is this much later than start
 rate_hz = 24.0
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -25,20 +25,12 @@ from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.sequences.native import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
 from bevcli.workshop.formats.camera_names import folder_of_images, match_names, renamed
-from bevcli.workshop.formats.matching import CameraImages, Found, Matched, match, measured_periods
+from bevcli.workshop.formats.matching import CameraImages, Found, match, measured_periods
 from bevcli.workshop.formats.name_times import NUMBER, Reading, listed_times, read_names
 from bevcli.workshop.formats.video_file import UNEVEN_TEXT, video_images
 
 FILE_NAME = "timing.toml"
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
-
-
-@dataclass(frozen=True)
-class CameraTiming:
-    """Timing of a camera. offset_ns: delay of its first image. rate_hz: images per second, None if not stated."""
-
-    offset_ns: int
-    rate_hz: float | None
 
 
 @dataclass(frozen=True)
@@ -49,13 +41,13 @@ class Timing:
         start_ns: time of the first image, None if not stated.
         rate_hz: images per second, None if not stated.
         times: what the numbers in image names are, None if not stated.
-        cameras: by camera.
+        cameras: delay of its first image, ns, and images per second, None if not stated, by camera.
     """
 
     start_ns: int | None
     rate_hz: float | None
     times: TimeKind | None
-    cameras: Mapping[str, CameraTiming]
+    cameras: Mapping[str, tuple[int, float | None]]
 
 
 def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = FolderOptions()) -> Timing:
@@ -74,7 +66,7 @@ def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = Fol
     for name in cameras:
         table = stated.get("cameras", {}).get(name, {})
         _check_table(path, f"cameras.{name}", table, ("offset_ns", "rate_hz"))
-        made[name] = CameraTiming(table.get("offset_ns", 0), table.get("rate_hz", rate_hz))
+        made[name] = table.get("offset_ns", 0), table.get("rate_hz", rate_hz)
     start_ns = stated.get("start_ns") if own.start_ns is None else own.start_ns
     return Timing(start_ns, rate_hz, own.times or stated.get("times"), made)
 
@@ -169,30 +161,33 @@ def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timin
     cameras = {}
     periods = measured_periods(reading.values)
     for camera, of_camera in paths.items():
-        times = reading.values[camera] + moved + timing.cameras[camera].offset_ns
+        times = reading.values[camera] + moved + timing.cameras[camera][0]
         order = np.argsort(times)
         sources = [ImageSource(of_camera[index], int(times[index])) for index in order.tolist()]
         cameras[camera] = CameraImages(f"the folder {of_camera[0].parent.name}", times[order], periods[camera],
                                        sources.__getitem__)  # fmt: skip
-    matched = match(cameras)
     of_start = f", moved so that the first is {start} ns" if moved and reading.is_known_origin else ""
-    return matched.entries, f"times are {reading.words}{of_start}, {_matched(cameras, matched)}"
+    return _matched(f"times are {reading.words}{of_start}", cameras)
 
 
-def _matched(cameras: Mapping[str, CameraImages], matched: Matched) -> str:
-    """The rates of cameras and how they were matched, in words."""
+def _matched(times: str, cameras: Mapping[str, CameraImages]) -> Found:
+    """The frames of cameras, with the rates and how they were matched. times: how these are stated."""
+    leading, entries = match(cameras)
     rates = sorted({f"{1e9 / each.period_ns:.1f}" for each in cameras.values()}, key=float)
     uneven = [each.name for each in cameras.values() if each.is_uneven]
-    parts = [f"{counted(len(cameras), 'cameras')} at {' to '.join(rates[:: max(len(rates) - 1, 1)])} Hz"]
+    parts = [times, f"{counted(len(cameras), 'cameras')} at {' to '.join(rates[:: max(len(rates) - 1, 1)])} Hz"]
     if len(cameras) > 1:
-        parts.append(f"matched to {matched.leading} within {np.ceil(matched.farthest_ns / 1e6):.0f} ms")
+        apart = max(max(entry.times_ns) - entry.stamp.timestamp_ns for entry in entries)
+        apart = max(apart, *(entry.stamp.timestamp_ns - min(entry.times_ns) for entry in entries))
+        parts.append(f"matched to {leading} within {np.ceil(apart / 1e6):.0f} ms")
     if uneven:
         parts.append(f"{', '.join(uneven)} {UNEVEN_TEXT}")
-    return ", ".join([*parts, _missing(matched.missing, len(matched.entries) * len(cameras))])
+    return entries, ", ".join([*parts, _missing(entries)])
 
 
-def _missing(missing: int, images: int) -> str:
-    return f"{missing or 'none'} of {counted(images, 'images')} missing"
+def _missing(entries: Sequence[FrameEntry]) -> str:
+    missing = sum(len(entry.dropped) for entry in entries)
+    return f"{missing or 'none'} of {counted(missing + sum(len(each.sources) for each in entries), 'images')} missing"
 
 
 def _from_indices(
@@ -213,17 +208,16 @@ def _from_indices(
         time_of = dict(zip(numbers, times, strict=True))
         stated = dict.fromkeys(numbered, time_of), how
     times_of, how = stated
-    entries, missing = [], 0
+    entries = list[FrameEntry]()
     for number in numbers:
         there = {camera: of[number] for camera, of in numbered.items() if number in of}
-        sources = {camera: ImageSource(path, times_of[camera][number] + timing.cameras[camera].offset_ns)
+        sources = {camera: ImageSource(path, times_of[camera][number] + timing.cameras[camera][0])
                    for camera, path in there.items()}  # fmt: skip
         time = times_of[next(iter(there))][number]
         dropped = {camera: f"no image {number} in {of_camera[0].parent}" for camera, of_camera in paths.items()
                    if camera not in there}  # fmt: skip
-        missing += len(dropped)
         entries.append(FrameEntry(FrameStamp(number, "", time), sources, dropped, f"{folder}: image {number}"))
-    return tuple(entries), f"numbered images {how}, {_missing(missing, len(entries) * len(paths))}"
+    return tuple(entries), f"numbered images {how}, {_missing(entries)}"
 
 
 def _listed_times(
@@ -289,12 +283,11 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
         of_camera = files.get(names.get(camera, ""), [])
         if len(of_camera) != 1:
             found = ", ".join(path.name for path in of_camera) or "none"
-            raise InputError(
-                f"{folder / 'videos'}: camera {camera}: expected one video, such as {camera}.mp4, found {found}"
-            )
-        own = timing.cameras[camera]
-        videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + own.offset_ns, own.rate_hz)
-    matched = match(videos)
+            expected = f"one video, such as {camera}.mp4"
+            raise InputError(f"{folder / 'videos'}: camera {camera}: expected {expected}, found {found}")
+        offset_ns, rate_hz = timing.cameras[camera]
+        videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + offset_ns, rate_hz)
     is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
     stated = "times as stated" if is_stated else "times from 0 on (state `start_ns` (`--start-ns`))"
-    return matched.entries, f"{stated}, {_matched(videos, matched)}{renamed(names)}"
+    entries, line = _matched(stated, videos)
+    return entries, line + renamed(names)
