@@ -16,8 +16,7 @@ from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.sequences.files.calibration_file import CALIBRATION, read_calibration
 from bevcli.workshop.formats import ExportOptions, LabelOptions
-from bevcli.workshop.formats.label_format import LabelledFrame, Labels
-from bevcli.workshop.formats.plausible_labels import LARGEST_RADIANS
+from bevcli.workshop.formats.label_format import LARGEST_RADIANS, LabelledFrame, Labels
 from bevcli.writing import write_whole
 
 LARGEST_BYTES = 256 * MIB

@@ -27,8 +27,7 @@ from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.view import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
-from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment
-from bevcli.workshop.formats.plausible_labels import check_labels
+from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment, check_labels
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 

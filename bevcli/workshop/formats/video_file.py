@@ -75,14 +75,12 @@ def open_video(path: Path, common: InputOptions, options: FolderOptions) -> List
     motion = poses.motion
     if motion is not None and options.ego_motion_file is not None:
         entries, understood = covered((entries, understood), motion)
-        check_covered(
-            options.ego_motion_file, poses, entries, "state the time of the first image by `start_ns` (`--start-ns`)"
-        )
+        advice = "state the time of the first image by `start_ns` (`--start-ns`)"
+        check_covered(options.ego_motion_file, poses, entries, advice)
     images = ListedDrive(path.parent, common, rig, entries, None)
     draft, poses = decided(replace(draft, rig=rig), poses, images, options)
     rig, motion = draft.rig, poses.motion
-    assumed = bev_frame_notes(rig, "the calibration")
-    notes = (*draft.notes, *assumed, *rotation_notes([path]), understood, *poses.notes)
+    notes = (*draft.notes, *bev_frame_notes(rig, "the calibration"), *rotation_notes([path]), understood, *poses.notes)
     if motion is None and common.ego_motion != "measured":
         without = "no history is used, and boxes are in the ego frame"
         notes += (f"a video has no poses: {without} (`odometry=True` (`--odometry`) measures them from the images)",)
@@ -100,17 +98,13 @@ def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) ->
     count, own_rate_hz = count_and_rate(path)
     times = np.round(np.arange(count) * 1e9 / (rate_hz or own_rate_hz)).astype(np.int64)
     stated = container_times_ns(path) if rate_hz is None else None
-    period = 1e9 / (rate_hz or own_rate_hz)
-    is_uneven = stated is not None and len(stated) > 1 and _is_uneven(stated, period)
+    period, is_uneven = 1e9 / (rate_hz or own_rate_hz), False
+    if stated is not None and len(stated) > 1:
+        is_uneven = bool(np.abs(stated - np.arange(len(stated)) * period).max() > UNEVEN * period)
     if stated is not None and is_uneven:
         times, period = stated, float(np.median(np.diff(stated)))
     times = start_ns + times
     return CameraImages(path.name, times, period, lambda index: ImageSource(path, int(times[index]), index), is_uneven)
-
-
-def _is_uneven(times_ns: NDArray[np.int64], period_ns: float) -> bool:
-    """True where an image is farther than `UNEVEN` of a period from where even ones would be."""
-    return bool(np.abs(times_ns - np.arange(len(times_ns)) * period_ns).max() > UNEVEN * period_ns)
 
 
 def container_times_ns(path: Path) -> Times | None:
