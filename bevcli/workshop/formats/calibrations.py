@@ -32,18 +32,11 @@ from bevcli.workshop.formats.camera_poses import (
     raised,
     rig_readings,
 )
-from bevcli.workshop.formats.information_files import is_information, read_information
+from bevcli.workshop.formats.information_files import read_information
 from bevcli.workshop.formats.kitti_drive import KITTI_FILES, read_kitti
 from bevcli.workshop.formats.markup import YAML_BYTES
-from bevcli.workshop.formats.named_calibration import SUFFIXES, files_in, read_document, read_named
-from bevcli.workshop.formats.other_calibrations import (
-    is_colmap,
-    is_nerfstudio,
-    read_colmap,
-    read_nerfstudio,
-    read_vins_fusion,
-    vins_files,
-)
+from bevcli.workshop.formats.named_calibration import SUFFIXES, read_document, read_named
+from bevcli.workshop.formats.other_calibrations import read_colmap, read_nerfstudio, read_vins_fusion
 
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera
@@ -200,9 +193,9 @@ def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:
 
 def _read_cameras(path: Path) -> tuple[str, Cameras]:
     """What a calibration is, in words, and its cameras."""
-    for format_name, (recognises, read) in KINDS.items():
-        if recognises(path):
-            return format_name, read(path)
+    for format_name, read in KINDS.items():
+        if (cameras := read(path)) is not None:
+            return format_name, cameras
     if path.is_dir():
         raise InputError(
             f"{path}: has no calibration (expected calibration.json, a file a camera ({', '.join(SUFFIXES)}), "
@@ -312,16 +305,12 @@ def _by_camera(value: ByCamera, names: tuple[str, ...], option: str) -> dict[str
     return {name: float(value[name]) for name in names}
 
 
-# What a file is -> whether a path is it, and its reader. The first that fits is taken.
-KINDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cameras]]] = {
-    "information file of BEVDet or mmdetection3d": (is_information, read_information),
-    "VINS-Fusion": (lambda path: bool(vins_files(path)), read_vins_fusion),
-    "COLMAP": (is_colmap, read_colmap),
-    "nerfstudio": (is_nerfstudio, read_nerfstudio),
-    "KITTI": (
-        lambda path: path.suffix == ".txt" or any((path / name).exists() for name in KITTI_FILES), read_kitti,
-    ),
-    "K, D and T by name": (
-        lambda path: path.suffix.lower() in SUFFIXES if not path.is_dir() else bool(files_in(path)), read_named,
-    ),
-}  # fmt: skip
+# What a file is -> its reader, which returns None for another one. The first that fits is taken.
+KINDS: dict[str, Callable[[Path], Cameras | None]] = {
+    "information file of BEVDet or mmdetection3d": read_information,
+    "VINS-Fusion": read_vins_fusion,
+    "COLMAP": read_colmap,
+    "nerfstudio": read_nerfstudio,
+    "KITTI": read_kitti,
+    "K, D and T by name": read_named,
+}

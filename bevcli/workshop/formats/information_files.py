@@ -33,21 +33,14 @@ HEAD_BYTES = 4096  # of a JSON file, in which the name of a list stands
 SAME_M = 1e-3
 
 
-def is_information(path: Path) -> bool:
-    """True for a pickle, and for a JSON file with a list of entries."""
-    if path.suffix.lower() in PICKLES:
-        return True
-    if path.suffix.lower() != ".json" or not path.is_file():
-        return False
-    with open_regular(path) as file:
-        head = file.read(HEAD_BYTES)
-    named = {name for name in (*LISTS, "cams", "images", "cam_intrinsic") if f'"{name}"'.encode() in head}
-    return not named.isdisjoint(LISTS) or len(named) > 1
+def read_information(path: Path) -> Cameras | None:
+    """The cameras of an information file, whose entries must have one rig; None for another calibration.
 
-
-def read_information(path: Path) -> Cameras:
-    """The cameras of an information file, whose entries must have one rig. Raises InputError."""
+    It is a pickle, or a JSON file with a list of entries. Raises InputError.
+    """
     is_pickle = path.suffix.lower() in PICKLES
+    if not is_pickle and not _has_entries(path):
+        return None
     entries = read_plain_pickle(path) if is_pickle else read_json(path, largest=LARGEST_BYTES)
     if isinstance(entries, dict):
         entries = next((entries[name] for name in LISTS if name in entries), entries)
@@ -59,6 +52,15 @@ def read_information(path: Path) -> Cameras:
         if rig.keys() != rigs[0].keys() or any(_differ(rig[name], rigs[0][name]) for name in rig):
             raise InputError(f"{path}: entry {index} has another rig than entry 0: keep those of this drive")
     return cameras_of(rigs[0], path)
+
+
+def _has_entries(path: Path) -> bool:
+    if path.suffix.lower() != ".json" or not path.is_file():
+        return False
+    with open_regular(path) as file:
+        head = file.read(HEAD_BYTES)
+    named = {name for name in (*LISTS, "cams", "images", "cam_intrinsic") if f'"{name}"'.encode() in head}
+    return not named.isdisjoint(LISTS) or len(named) > 1
 
 
 def _differ(camera: dict[str, Any], other: dict[str, Any]) -> bool:

@@ -51,12 +51,14 @@ def open_kitti(path: Path, common: InputOptions, options: FolderOptions) -> Fold
     return FolderDrive(path, common, options)
 
 
-def read_kitti(path: Path) -> Cameras:
-    """The rectified cameras of KITTI: image_02 of calib_cam_to_cam.txt, image_2 of P2 in other files.
+def read_kitti(path: Path) -> Cameras | None:
+    """The rectified cameras of KITTI: image_02 of calib_cam_to_cam.txt, image_2 of P2 in other files; None for others.
 
     The origin is on the road, below the rear axle. Poses need Tr_velo_to_cam, Tr, or calib_velo_to_cam.txt beside.
     """
     file = next((path / name for name in KITTI_FILES if (path / name).exists()), path)
+    if file.suffix != ".txt":
+        return None
     rows = _kitti_rows(file)
     camera0_from_velodyne = _camera0_from_velodyne(rows, file)
     rectification = next((_row(rows, key, 9, file) for key in ("R_rect_00", "R0_rect", "R_rect") if key in rows), None)

@@ -52,13 +52,16 @@ PINHOLES = ("pinhole", "none", "perspective")
 NO_TRANSFORM = "is not understood as a transform (expected 4x4 or 3x4 numbers, or a rotation and a translation)"
 
 
-def read_named(path: Path) -> Cameras:
-    """The cameras of a file with K, D and T, or of a folder of such files, in which poses may be files of their own."""
-    if not path.is_dir():
-        return cameras_of(read_document(path), path)
-    cameras: Cameras = {}
-    for file in files_in(path):
-        for name, of in read_named(file).items():
+def read_named(path: Path) -> Cameras | None:
+    """The cameras of a file with K, D and T, or of a folder of such files, in which poses may be files of their own.
+
+    None for another calibration. Raises InputError.
+    """
+    files, cameras = files_in(path) if path.is_dir() else [path], Cameras()
+    if not files or (files == [path] and path.suffix.lower() not in SUFFIXES):
+        return None
+    for file in files:
+        for name, of in cameras_of(read_document(file), file).items():
             other = cameras.get(name, of)
             if other is not of and (of.intrinsics is None) == (other.intrinsics is None):
                 raise InputError(f"{file}: camera {name} is in another file too: keep one")

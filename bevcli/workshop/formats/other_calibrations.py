@@ -52,23 +52,19 @@ VINS_CALIBRATION, VINS_LINE = re.compile(r"cam(\d+)_calib"), re.compile(rb"^cam\
 KANNALA_BRANDT = {"mu": "fx", "mv": "fy", "u0": "cx", "v0": "cy", "k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4"}
 
 
-def is_colmap(path: Path) -> bool:
-    """True for cameras.txt, and for a folder that has it. Raises InputError for a folder with binary files only."""
-    if not path.is_dir():
-        return path.name == "cameras.txt"
-    if _colmap_folder(path, "cameras.txt") is None and (folder := _colmap_folder(path, "cameras.bin")) is not None:
-        how = "convert it (`colmap model_converter --output_type TXT …`)"
-        raise InputError(f"{folder / 'cameras.bin'}: is binary: {how}")
-    return _colmap_folder(path, "cameras.txt") is not None
+def read_colmap(path: Path) -> Cameras | None:
+    """The cameras of COLMAP's cameras.txt, of which images.txt has the poses; None for another calibration.
 
-
-def _colmap_folder(path: Path, file: str) -> Path | None:
-    return next((path / inner for inner in ("", "sparse/0", "sparse") if (path / inner / file).exists()), None)
-
-
-def read_colmap(path: Path) -> Cameras:
-    """The cameras of COLMAP's cameras.txt. images.txt has their poses and names, those of the images' folders."""
-    folder = (_colmap_folder(path, "cameras.txt") if path.is_dir() else path.parent) or path
+    Their names are those of the images' folders. Raises InputError, also for a folder with binary files only.
+    """
+    inside = [path / name for name in ("", "sparse/0", "sparse")] if path.is_dir() else [path.parent]
+    inside = inside if path.is_dir() or path.name == "cameras.txt" else []
+    folder = next((each for each in inside if (each / "cameras.txt").exists()), None)
+    binary = next((file for each in inside if (file := each / "cameras.bin").exists()), None)
+    if folder is None and binary is not None:
+        raise InputError(f"{binary}: is binary: convert it (`colmap model_converter --output_type TXT …`)")
+    if folder is None:
+        return None
     by_id = {}
     for number, line in lines_of(folder / "cameras.txt"):
         words, where = line.split(), f"{folder / 'cameras.txt'}: line {number}"
@@ -152,19 +148,15 @@ def _one_camera(cameras: list[StatedCamera], where: str) -> StatedCamera:
     return replace(cameras[0], intrinsics=np.median(matrices, axis=0).tolist())
 
 
-def is_nerfstudio(path: Path) -> bool:
-    """True for transforms.json, and for a folder that has it."""
-    file = path / "transforms.json" if path.is_dir() else path
-    if file.suffix.lower() != ".json" or not file.is_file():
-        return False
-    document = read_json(file)
-    return isinstance(document, dict) and "frames" in document and "cameras" not in document
+def read_nerfstudio(path: Path) -> Cameras | None:
+    """The cameras of nerfstudio's transforms.json, by the folders of the images; None for another calibration.
 
-
-def read_nerfstudio(path: Path) -> Cameras:
-    """The cameras of nerfstudio's transforms.json, by the folders of the images; camera axes are those of OpenGL."""
+    The camera axes are those of OpenGL. Raises InputError.
+    """
     file = path / "transforms.json" if path.is_dir() else path
-    document = read_json(file)
+    document = read_json(file) if file.suffix.lower() == ".json" and file.is_file() else None
+    if not isinstance(document, dict) or "frames" not in document or "cameras" in document:
+        return None
     frames = document.get("frames")
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames) or not frames:
         expected = "a list of objects with file_path and transform_matrix"
@@ -193,20 +185,21 @@ def _nerf_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
     return StatedCamera(matrix, size if None not in size else None, lens)
 
 
-def vins_files(path: Path) -> list[Path]:
-    """The file of VINS-Fusion that names others, or all of a folder; none for another calibration."""
+def read_vins_fusion(path: Path) -> Cameras | None:
+    """The cameras cam0, cam1 of VINS-Fusion; None for another calibration.
+
+    path: the file that names others, or a folder, of whose files that with most cameras is taken. Raises InputError.
+    """
     files = [path] if path.is_file() else files_in(path)
     files = [file for file in files if file.suffix.lower() in (".yaml", ".yml")]
-    return [file for file in files if VINS_LINE.search(read_bytes(file, YAML_BYTES))]
-
-
-def read_vins_fusion(path: Path) -> Cameras:
-    """The cameras cam0, cam1 of VINS-Fusion. Of several files in a folder, that with most cameras is taken."""
-    rigs = [_vins_cameras(file) for file in vins_files(path)]
+    files = [file for file in files if VINS_LINE.search(read_bytes(file, YAML_BYTES))]
+    if not files:
+        return None
+    rigs = [_vins_cameras(file) for file in files]
     most = max(map(len, rigs))
     rig, *others = [rig for rig in rigs if len(rig) == most]
     if any(other != rig for other in others):
-        names = ", ".join(file.name for file in vins_files(path))
+        names = ", ".join(file.name for file in files)
         raise InputError(f"{path}: has several configurations ({names}): pass one of these files")
     return cameras_of(rig, path)
 
