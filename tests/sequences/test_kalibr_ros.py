@@ -2,7 +2,6 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 
@@ -90,32 +89,6 @@ def test_folder_of_ros_files(tmp_path):
     assert rig["narrow"].distortion.coefficients == (0.1, -0.2, 0.001, 0.002, 0.03)
     assert rig["wide"].distortion.coefficients == (0.1, 0.2, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1)
     np.testing.assert_allclose(rig["wide"].intrinsics, [[500, 0, 320], [0, 501, 240], [0, 0, 1]])
-
-
-OPENCV = """%YAML:1.0
----
-image_width: 640
-image_height: 480
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [ 5.0e+02, 0., 320., 0., 5.01e+02, 240., 0., 0., 1. ]
-distortion_coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: [ 0.1, -0.2, 0.001, 0.002, 0.03 ]
-"""
-
-
-def test_the_file_that_opencv_writes(tmp_path):
-    stated = cv2.FileStorage(OPENCV, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    camera = read(tmp_path, OPENCV, "intrinsics")
-    np.testing.assert_array_equal(camera.intrinsics, stated.getNode("camera_matrix").mat())
-    np.testing.assert_array_equal(
-        camera.distortion.coefficients, stated.getNode("distortion_coefficients").mat().ravel()
-    )
 
 
 @pytest.mark.parametrize(
