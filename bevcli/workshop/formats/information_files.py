@@ -91,7 +91,8 @@ def _camera(camera: dict[str, Any], ego_from_lidar: Array | None, where: str) ->
         intrinsics, lidar_from_camera = _split(image_from_lidar)
     if intrinsics is None:
         raise InputError(f"{where}: has no intrinsics (expected cam_intrinsic, cam2img or lidar2img)")
-    made = {"K": intrinsics[:3, :3].tolist(), **{key: camera[key] for key in ("width", "height") if key in camera}}
+    made: dict[str, Any] = {key: camera[key] for key in ("width", "height") if key in camera}
+    made["K"] = intrinsics[:3, :3].tolist()
     if ego_from_camera is None and lidar_from_camera is not None and ego_from_lidar is not None:
         ego_from_camera = ego_from_lidar @ lidar_from_camera
     if ego_from_camera is not None:

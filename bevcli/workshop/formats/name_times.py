@@ -77,7 +77,8 @@ class Reading:
     @cached_property
     def steps(self) -> list[Times]:
         """Of each camera with two or more images, the steps from one to the next."""
-        return [np.diff(np.sort(times)) for times in self.values.values() if len(times) > 1]
+        ordered = [np.sort(times) for times in self.values.values() if len(times) > 1]
+        return [times[1:] - times[:-1] for times in ordered]
 
     @cached_property
     def has_rate(self) -> bool:

@@ -88,8 +88,8 @@ def read_colmap(path: Path) -> Cameras | None:
         return {f"camera{key}": camera for key, camera in by_id.items()}
     camera_of = {path: camera for path, camera, *_ in images}
     each_its_own = len(set(camera_of.values())) == len(camera_of) > 1
-    pose = StatedPose({}, "camera_from_ego", axes="optical", name=file.name)
-    return _cameras_of_images(folder / "cameras.txt", images, pose, each_its_own=each_its_own)
+    stated = StatedPose({}, "camera_from_ego", axes="optical", name=file.name)
+    return _cameras_of_images(folder / "cameras.txt", images, stated, each_its_own=each_its_own)
 
 
 def _colmap_camera(model: str, parameters: list[Any], where: str) -> StatedCamera:
