@@ -31,21 +31,19 @@ if TYPE_CHECKING:
         Prediction as Prediction,
         Sequence as Sequence,
     )
-    from bevcli.geometry.boxes import Box3D as Box3D, Boxes3D as Boxes3D
-    from bevcli.geometry.boxes2d import Box2D as Box2D, Boxes2D as Boxes2D
+    from bevcli.geometry.boxes import Box2D as Box2D, Box3D as Box3D, Boxes2D as Boxes2D, Boxes3D as Boxes3D
     from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
     from bevcli.inference.load import Model as Model, load_model as load_model
     from bevcli.inference.run import Session as Session, run as run
-    from bevcli.recording.options import RecordingOptions as RecordingOptions
+    from bevcli.recording import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
     from bevcli.runs.run_into_folder import RunOptions as RunOptions, run_into_folder as run_into_folder
     from bevcli.sequences.files.calibration_file import read_calibration as read_calibration
     from bevcli.sequences.open import open_sequence as open_sequence
     from bevcli.viewer.recording_file import screenshot as screenshot, show as show
-    from bevcli.weights.model_file import model_file_for as model_file_for
     from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.engines.exported import export_onnx as export_onnx, quantize as quantize
@@ -60,6 +58,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.training.train import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
     from bevcli.workshop.video import video as video
+    from bevcli.workshop.weights.model_file import model_file_for as model_file_for
 
 
 @cache

@@ -1,12 +1,16 @@
-"""Errors caused by a user's mistake. The command line prints the message on one line and exits with code 1.
+"""Errors caused by a user's mistake, and findings about a calibration.
+
+The command line prints the message of an error on one line and exits with code 1.
 
 A message states what is wrong and where, what was expected and found, and what to do:
 ``calibration.json: camera CAM_BACK: "intrinsics" is missing (expected 3x3)``.
 """
 
 import re
+from collections.abc import Iterable
 from concurrent.futures import Future, TimeoutError as FutureTimeout
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Literal, TypeVar
 
 from bevcli.printing import LONGEST_LIST, one_line
 
@@ -63,3 +67,43 @@ def result_within(future: Future[T], seconds: float, what: str) -> T:
         if future.done():  # the exception of the task itself, such as a network folder's time-out
             raise
         raise WaitError(f"{what}: no answer within {seconds:.0f} s") from None
+
+
+Severity = Literal["error", "warning", "info"]
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding about a calibration or sequence.
+
+    Attributes:
+        code: stable name of the kind of finding, listed in docs/calibration.md.
+        severity: "error", "warning" or "info".
+        camera: name of the camera, None for the whole rig.
+        message: what is wrong.
+        found: the value found, with its unit; "" if there is none.
+        expected: the value expected, with its unit; "" if there is none.
+        advice: what to do; "" if there is none.
+    """
+
+    code: str
+    severity: Severity
+    camera: str | None
+    message: str
+    found: str = ""
+    expected: str = ""
+    advice: str = ""
+
+    @property
+    def line(self) -> str:
+        """The finding on one line: `camera CAM_BACK: "intrinsics" is missing (expected 3x3)`."""
+        prefix = f"camera {self.camera}: " if self.camera else ""
+        numbers = [f"{word} {value}" for word, value in (("expected", self.expected), ("found", self.found)) if value]
+        brackets = f" ({', '.join(numbers)})" if numbers else ""
+        return f"{prefix}{self.message}{brackets}" + (f": {self.advice}" if self.advice else "")
+
+
+def errors_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The findings of severity "error", in their order."""
+    return tuple(finding for finding in findings if finding.severity == "error")

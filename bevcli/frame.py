@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes2D, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, SHOWN_SCORE, Color, ObjectClass
@@ -487,7 +486,7 @@ class Prediction:
 
         Raises InputError for an unknown camera or color order, and where `frame` is None.
         """
-        from bevcli.viewer.plot import plot
+        from bevcli.workshop.plot import plot
 
         return plot(self, image, score, color_order)
 

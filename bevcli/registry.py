@@ -56,7 +56,7 @@ OWN: dict[Group, dict[str, str]] = {
         "train": "bevcli.workshop.training.commands:train",
         "validate": "bevcli.workshop.training.commands:validate",
         "viz": "bevcli.cli.commands:viz",
-        "weights": "bevcli.cli.weights:weights_app",
+        "weights": "bevcli.workshop.weights.commands:weights_app",
     },
 }
 

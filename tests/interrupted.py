@@ -6,7 +6,7 @@ import pytest
 
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.inference.load import Model
-from bevcli.runs.options import RunOptions
+from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 
 

@@ -15,7 +15,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
 from bevcli.model.config import ModelConfig
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer.native import NO_DRIVER, take_screenshot
 

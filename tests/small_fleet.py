@@ -8,8 +8,8 @@ from memory_drive import MemoryDrive, make_camera
 from recorded_drive import with_truth
 
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, default_ego_from_bev
-from bevcli.inference.options import ModelOptions
-from bevcli.recording.options import RecordingOptions
+from bevcli.inference import ModelOptions
+from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions
 from bevcli.workshop.batch.job import Job
 from bevcli.workshop.formats.output import NativeWriter

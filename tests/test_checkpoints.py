@@ -19,6 +19,7 @@ from bevcli.checkpoints import (
     compare,
     convert,
     expected_state,
+    from_official,
     load_weights,
     read_checkpoint,
     require_fit,
@@ -28,12 +29,10 @@ from bevcli.config import known_models, load_config
 from bevcli.errors import OutputError, WeightsError
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.inference.load import load_model
-from bevcli.model import parts
-from bevcli.model.official_keys import from_official
-from bevcli.model.parts import model_parts
 from bevcli.model.temporal_model import build_model
-from bevcli.weights.model_file import model_file_for
 from bevcli.workshop.training.warm_start import warm_start
+from bevcli.workshop.weights import model_file as parts
+from bevcli.workshop.weights.model_file import model_file_for, model_parts
 
 KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_text())
 

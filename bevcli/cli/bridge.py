@@ -13,7 +13,7 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import typer
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.inference.options import complete_model
+from bevcli.inference import complete_model
 from bevcli.options import Option, Reads, defaults
 from bevcli.printing import did_you_mean
 from bevcli.registry import is_of_hub

@@ -11,11 +11,11 @@ from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.errors import InputError
 from bevcli.options import Option, defaults, named
 from bevcli.printing import say
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.rig import CheckOptions
 from bevcli.sequences.format import formats
 from bevcli.sequences.options import InputOptions
-from bevcli.viewer.options import ViewOptions
+from bevcli.viewer import ViewOptions
 from bevcli.writing import output_errors, write_whole
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look"}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
 import typer
 
-from bevcli.inference.options import ModelOptions
+from bevcli.inference import ModelOptions
 from bevcli.printing import duration, one_line, say
 
 if TYPE_CHECKING:

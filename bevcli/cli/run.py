@@ -11,11 +11,11 @@ import typer
 from bevcli.cli.bridge import FormatValues, InputDrive
 from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
-from bevcli.inference.options import PHOTOGRAPHS, ModelOptions
+from bevcli.inference import PHOTOGRAPHS, ModelOptions
 from bevcli.options import Option
 from bevcli.printing import print_note, say
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import OutputOptions, RunOptions
+from bevcli.recording import RecordingOptions
+from bevcli.runs import OutputOptions, RunOptions
 from bevcli.sequences.format import format_of
 from bevcli.sequences.native import holds_videos_alone
 from bevcli.sequences.options import InputOptions

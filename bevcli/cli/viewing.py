@@ -8,10 +8,10 @@ from bevcli.cli.bridge import FormatValues
 from bevcli.cli.progress import Progress, open_with_bar
 from bevcli.errors import InputError
 from bevcli.printing import counted, say
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.sequences.options import InputOptions
+from bevcli.viewer import ViewOptions
 from bevcli.viewer.native import display_is_there, show_window, take_screenshot
-from bevcli.viewer.options import ViewOptions
 from bevcli.viewer.recording_file import (
     RECORDING,
     check_is_drive,

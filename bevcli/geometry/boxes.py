@@ -271,3 +271,54 @@ def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64],
     with np.errstate(divide="ignore", invalid="ignore"):
         velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
     return np.where(is_short[:, None], velocities, np.nan)
+
+
+@dataclass(frozen=True)
+class Box2D:
+    """One of `Boxes2D`.
+
+    Attributes:
+        class_name: such as "person".
+        score: confidence, 0 to 1.
+        corners: (4,) x0, y0, x1, y1, pixels.
+    """
+
+    class_name: str
+    score: float
+    corners: Array
+
+    def __repr__(self) -> str:
+        x0, y0, x1, y1 = self.corners
+        return f"Box2D({self.class_name} {self.score:.2f} at {x0:.0f}, {y0:.0f}, {x1:.0f}, {y1:.0f})"
+
+
+@dataclass(frozen=True)
+class Boxes2D:
+    """N boxes in an image, by falling score. They are a sequence of `Box2D`.
+
+    Attributes:
+        corners: (N, 4) x0, y0, x1, y1, pixels of the camera's image, whose first pixel has its centre at (0, 0): a box
+            of the whole image is (-0.5, -0.5, width - 0.5, height - 0.5).
+        classes: (N,) names of COCO: person, bicycle, car, motorcycle, bus, truck, traffic light.
+        scores: (N,) confidence, 0 to 1.
+    """
+
+    corners: Array
+    classes: NDArray[np.str_]
+    scores: Array
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def __iter__(self) -> Iterator[Box2D]:
+        for class_name, score, corners in zip(self.classes, self.scores, self.corners, strict=True):
+            yield Box2D(str(class_name), float(score), corners)
+
+    def scored(self, least: float) -> "Boxes2D":
+        """Those with this score or more."""
+        chosen = self.scores >= least
+        return Boxes2D(self.corners[chosen], self.classes[chosen], self.scores[chosen])
+
+    def outlines(self) -> Array:
+        """(N, 5, 2) pixels, closed."""
+        return self.corners[:, [[0, 1], [2, 1], [2, 3], [0, 3], [0, 1]]]

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
 from bevcli.model.config import ImageConfig

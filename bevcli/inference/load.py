@@ -23,8 +23,7 @@ from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.frame import ColorOrder, Drive, Frame, FrameStamp, Prediction, check_color_order
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.frames_from_memory import checked_images
-from bevcli.inference.options import (
+from bevcli.inference import (
     EXPORTED_SUFFIX,
     FILE_ENGINE,
     PHOTOGRAPHS,
@@ -33,12 +32,12 @@ from bevcli.inference.options import (
     ModelOptions,
     StepOptions,
 )
-from bevcli.inference.preprocess import image_for_rig
+from bevcli.inference.preprocess import checked_images, image_for_rig
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.inference.training_rigs import facts_notes, training_rig_notes
+from bevcli.model import AnyPrecision
 from bevcli.model.config import ModelConfig
-from bevcli.model.precision import AnyPrecision
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather

@@ -14,13 +14,13 @@ from bevcli.frame import ColorOrder, Drive, DriveFacts, Frame, FrameStamp, Predi
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import Kinematics, RecentPoses
 from bevcli.geometry.transforms import Pose
-from bevcli.inference.frames_from_memory import (
+from bevcli.inference import StepOptions
+from bevcli.inference.load import Model
+from bevcli.inference.preprocess import (
     check_cameras,
     checked_images,
     whole_nanoseconds,
 )
-from bevcli.inference.load import Model
-from bevcli.inference.options import StepOptions
 from bevcli.inference.runner import RunnerState, one_command
 from bevcli.options import refuse, spread
 

@@ -10,3 +10,10 @@ It has a configuration, `ModelConfig` or a subclass with `architecture = "MyMode
 `TemporalModel` and `ModelConfig` has a default. A subclass of `Network` (`network.py`) has the paper's parts: it can be
 trained and timed, and its attentions can be shown.
 """
+
+from typing import Literal
+
+Precision = Literal["fp32", "bf16", "fp16"]
+"""Of a model in PyTorch."""
+AnyPrecision = Literal["fp32", "bf16", "fp16", "int8"]
+"""Of a model in any engine: only other engines have INT8."""

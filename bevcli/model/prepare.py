@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from bevcli.errors import WeightsError
+from bevcli.model import Precision
 from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
@@ -24,7 +25,6 @@ from bevcli.model.kernels.compiled import CompiledPool, load_compiled
 from bevcli.model.kernels.onednn import has_matrix_unit, use_onednn
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import Pillars
-from bevcli.model.precision import Precision
 from bevcli.model.resnet import ResNet
 from bevcli.model.temporal_model import TemporalModel
 

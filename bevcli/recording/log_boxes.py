@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes2D, Boxes3D
 from bevcli.geometry.matching import MATCH_DISTANCE_M, ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities
-from bevcli.recording.components import Components, any_values, components, line_strips, log, ui_points
+from bevcli.recording.entities import Components, any_values, components, line_strips, log, ui_points
 
 OF_COCO = {"person": "pedestrian"}  # classes of boxes in images that are called otherwise in the scene
 LABELS_IN_SCENE = 10  # only the nearest boxes are labelled

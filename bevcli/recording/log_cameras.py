@@ -9,13 +9,12 @@ import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.frame import CameraImage, CameraSamples
-from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import BOX_EDGES, Boxes2D, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, apply
 from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
-from bevcli.recording.components import Components, components, log, ui_points
+from bevcli.recording.entities import Components, components, log, ui_points
 
 if TYPE_CHECKING:
     from bevcli.recording.av1 import Av1Encoder

@@ -18,7 +18,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.recording import entities, log_boxes, log_cameras
-from bevcli.recording.components import components, line_strips, log, rgb_format, ui_points
+from bevcli.recording.entities import components, line_strips, log, rgb_format, ui_points
 from bevcli.recording.log_cameras import PosedCamera
 
 Features = NDArray[np.float32]

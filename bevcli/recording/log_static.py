@@ -19,11 +19,10 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color, ObjectClass,
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.model.config import ModelConfig
 from bevcli.printing import counted
-from bevcli.recording import entities
-from bevcli.recording.components import log, packed
+from bevcli.recording import RecordingOptions, entities
+from bevcli.recording.entities import log, packed
 from bevcli.recording.log_cameras import labels_2d
 from bevcli.recording.meshes import Mesh, VehicleMesh, default_vehicle
-from bevcli.recording.options import RecordingOptions
 
 UNTRAINED = "untrained weights"
 FROM_RENDERED = "trained on renderings"

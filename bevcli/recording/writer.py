@@ -23,9 +23,9 @@ from bevcli.frame import BevMap, Frame, FrameStamp, GroundLines, Prediction, res
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
-from bevcli.recording import entities, log_boxes, log_cameras, log_static, meshes
+from bevcli.recording import RecordingOptions, entities, log_boxes, log_cameras, log_static, meshes
 from bevcli.recording.blueprint import recording_blueprint
-from bevcli.recording.components import any_values, components, log
+from bevcli.recording.entities import any_values, components, log
 from bevcli.recording.log_cameras import ImageLayer, PosedCamera
 from bevcli.recording.log_ground import (
     BevColors,
@@ -38,7 +38,6 @@ from bevcli.recording.log_ground import (
     log_probes,
 )
 from bevcli.recording.log_static import Recorded, RecordedBoxes, RecordedDrive, RecordedModel
-from bevcli.recording.options import RecordingOptions
 from bevcli.sequences.files.incremental_json import GrowingFile
 
 PosedCameras = tuple[PosedCamera, ...]

@@ -10,7 +10,7 @@ drawings             cameras.png, coverage.png and recording.rrd
 
 from pathlib import Path
 
-from bevcli.inference.options import complete_model
+from bevcli.inference import complete_model
 from bevcli.options import option, options
 
 

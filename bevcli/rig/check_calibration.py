@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.config import load_config
-from bevcli.errors import InputError
-from bevcli.findings import SEVERITIES, Finding, errors_of
+from bevcli.errors import SEVERITIES, Finding, InputError, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.training_rigs import training_rig_notes

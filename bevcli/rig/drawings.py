@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import Color
@@ -29,8 +29,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.parsing.images import encode_image
 from bevcli.recording import entities, log_cameras, log_static
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view
-from bevcli.recording.components import log
-from bevcli.recording.entities import GROUND_GRID_COLOR, HORIZON_COLOR, PILLAR_COLOR, colormap
+from bevcli.recording.entities import GROUND_GRID_COLOR, HORIZON_COLOR, PILLAR_COLOR, colormap, log
 from bevcli.rig.coverage import Coverage, Measure, pixels_in_image
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg, seen_range_deg
 from bevcli.viewer.drawing import FONT, Canvas, draw_lines

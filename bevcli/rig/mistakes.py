@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera
 from bevcli.geometry.transforms import Array, inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from bevcli.rig import rig_checks

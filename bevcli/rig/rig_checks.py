@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.geometry.cameras import BEV_ORIGIN_M, Camera
 from bevcli.geometry.transforms import Array
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bevcli.findings import Finding, errors_of
+from bevcli.errors import Finding, errors_of
 from bevcli.frame import Drive, FrameStamp
 from bevcli.geometry.cameras import BEV_ORIGIN, Camera, CameraRig
 from bevcli.geometry.ego_motion import EgoMotion

@@ -19,9 +19,8 @@ from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
 from bevcli.model.upload import tensors_in
 from bevcli.recording.writer import LiveSink, Recording
-from bevcli.runs.folder import RunFolder
-from bevcli.runs.options import RunOptions
-from bevcli.runs.state import FilesState, RunState, save_state
+from bevcli.runs import RunOptions
+from bevcli.runs.state import FilesState, RunFolder, RunState, save_state
 from bevcli.runs.summary import RunSummary
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.boxes_table import CsvWriter, ImageBoxesWriter
@@ -32,7 +31,7 @@ from bevcli.sequences.files.map_folder import map_path, write_map
 from bevcli.writing import partial_path, whole_file, write_whole
 
 if TYPE_CHECKING:
-    from bevcli.sequences.files.submission import SubmissionWriter
+    from bevcli.workshop.formats.submission import SubmissionWriter
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
 TRACKS, IMAGE_BOXES, SEGMENTATION = "tracks.csv", "image_boxes.csv", "segmentation"
@@ -204,7 +203,7 @@ class RunFiles:
         return file
 
     def _open_submission(self) -> "SubmissionWriter":
-        from bevcli.sequences.files.submission import SubmissionWriter  # nuScenes drives only
+        from bevcli.workshop.formats.submission import SubmissionWriter  # nuScenes drives only
 
         return self._open(SUBMISSION, SubmissionWriter)
 

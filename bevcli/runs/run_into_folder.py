@@ -13,11 +13,10 @@ from bevcli.inference.pipeline import write_behind
 from bevcli.model.temporal_model import model_class
 from bevcli.recording.writer import LiveSink
 from bevcli.rig.sequence_checks import input_errors
+from bevcli.runs import RunOptions
 from bevcli.runs.files import RunFiles
-from bevcli.runs.folder import SUMMARY, RunFolder
-from bevcli.runs.options import RunOptions
-from bevcli.runs.state import START_ANEW, RunState, run_fingerprint, save_state, saved_state
-from bevcli.runs.summary import Counts, RunSummary
+from bevcli.runs.state import START_ANEW, RunFolder, RunState, run_fingerprint, save_state, saved_state
+from bevcli.runs.summary import SUMMARY, Counts, RunSummary
 from bevcli.sequences.images import no_image_error
 
 

@@ -12,10 +12,10 @@ from bevcli.frame import Drive, Frame, Prediction
 from bevcli.inference.image_repair import BLACK_SHARE, WHITE_SHARE, grey_levels, sampled
 from bevcli.inference.load import Model
 from bevcli.printing import counted, duration
-from bevcli.runs.folder import SUMMARY
-from bevcli.runs.options import RunOptions
+from bevcli.runs import RunOptions
 from bevcli.writing import write_whole
 
+SUMMARY = "summary.json"
 NEARLY_BLACK, NEARLY_WHITE = 24, 231  # grey levels that no image reaches whose numbers are stored in too many bits
 RATIO = 1.01  # of two neighbouring bins of a `RunningMedian`
 

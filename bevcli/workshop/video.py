@@ -24,10 +24,10 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, color_
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import plain_name
 from bevcli.parsing.images import decode_image
-from bevcli.recording import entities
+from bevcli.recording import entities, has_av, require_av
 from bevcli.recording.blueprint import rows_by_yaw
 from bevcli.recording.entities import Color, class_colors, map_colors
-from bevcli.recording.options import has_av, require_av
+from bevcli.viewer import VideoView
 from bevcli.viewer.drawing import (
     BACKGROUND,
     BEV_MARGIN,
@@ -52,7 +52,6 @@ from bevcli.viewer.drawing import (
     new_sheet,
     tiles_of,
 )  # fmt: skip
-from bevcli.viewer.options import VideoView
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file

@@ -18,7 +18,7 @@ from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import rigid, rotation_about_z
 from bevcli.sequences.files.calibration_file import read_calibration, write_calibration
-from bevcli.sequences.view import DriveView
+from bevcli.sequences.open import DriveView
 from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibrating, in_turn
 from bevcli.workshop.calibration.calibrate import findings_of
 from bevcli.workshop.calibration.estimates import Verdict, common_delay_text, either_text

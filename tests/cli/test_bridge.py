@@ -14,8 +14,8 @@ from bevcli.cli.bridge import Part, command
 from bevcli.cli.main import PlainCommand, app
 from bevcli.config import known_models
 from bevcli.errors import BevcliError
+from bevcli.inference import complete_model
 from bevcli.inference.load import Model, choose_device
-from bevcli.inference.options import complete_model
 from bevcli.options import Option, named, option, options
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions, parse_frames, parse_rate

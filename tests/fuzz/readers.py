@@ -110,15 +110,14 @@ def _recording(folder: Path) -> None:
 
 def _state(folder: Path) -> None:
     from bevcli.model.bevformer.bevformer import BevHistory
-    from bevcli.runs.folder import RunFolder
-    from bevcli.runs.state import RunState, saved_state
+    from bevcli.runs.state import RunFolder, RunState, saved_state
 
     with RunFolder(folder / "out", resume=True) as out:
         saved_state(out, {"model": "mini"}, RunState[BevHistory])
 
 
 def _older_run(folder: Path) -> None:
-    from bevcli.runs.folder import RunFolder
+    from bevcli.runs.state import RunFolder
 
     with RunFolder(folder / "older", force=True):
         pass

@@ -9,8 +9,8 @@ from command_line import command
 
 import bevcli
 from bevcli.errors import InputError
+from bevcli.inference import ModelOptions
 from bevcli.inference.load import choose_model, default_model
-from bevcli.inference.options import ModelOptions
 
 SAMPLES = Path(__file__).parents[2] / "samples"
 STREET = SAMPLES / "street"

@@ -17,7 +17,7 @@ from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.config import ModelConfig
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.workshop.training import validation

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from stated_rule import rule_image, rule_tensor
 
+from bevcli.checkpoints import from_official
 from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import Kinematics
@@ -25,7 +26,6 @@ from bevcli.geometry.transforms import Pose, rigid, rotation_from_quaternion
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
-from bevcli.model.official_keys import from_official
 from bevcli.model.step import ModelInputs
 from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config, WindowFrame, other_bev_from_bev

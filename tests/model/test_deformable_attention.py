@@ -10,9 +10,9 @@ from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, 
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
 from bevcli.model.kernels.compiled import CompiledSampling, Hits, sample_hits
 from bevcli.model.kernels.loops import softmax_of_groups
-from bevcli.model.kernels.training import LearnedSampling
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.workshop.benchmark.versions import PaddedSampling
+from bevcli.workshop.training.kernels import LearnedSampling
 
 TWO_LEVELS = ((4, 6), (2, 3))
 sample = GridSampling()

@@ -9,7 +9,7 @@ from torch import nn
 import bevcli.model.kernels.compiled as compiled
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, modulated_deformable_convolution
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution
-from bevcli.model.kernels.training import choose_training_kernels
+from bevcli.workshop.training.kernels import choose_training_kernels
 
 
 @pytest.mark.parametrize("stride", [1, 2])

@@ -15,7 +15,6 @@ from torch import nn
 
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError
-from bevcli.model import parts
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLite, EfficientNetLiteConfig
 from bevcli.model.fpn import FPN, FPNConfig
@@ -24,6 +23,7 @@ from bevcli.model.kernels.onednn import PackedConvolution, has_onednn, use_onedn
 from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
+from bevcli.workshop.weights import model_file as parts
 
 ALL_STAGES = (1, 2, 3, 4, 5, 6, 7)
 

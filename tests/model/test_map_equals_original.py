@@ -15,11 +15,11 @@ import pytest
 import torch
 from uniad_rule import rule_bev, uniad_shapes, uniad_state, uniad_tensor
 
+from bevcli.checkpoints import from_official
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.kernels.compiled import CompiledSampling
 from bevcli.model.kernels.onednn import use_onednn
-from bevcli.model.official_keys import from_official
 from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map, thing_scores
 
 KEPT = np.load(original.DATA / "golden_uniad_map.npz")

@@ -18,10 +18,9 @@ import pytest
 import torch
 from vad_rule import rule_vad, vad_shapes, vad_tensor
 
-from bevcli.checkpoints import expected_state
+from bevcli.checkpoints import expected_state, from_official
 from bevcli.config import load_config
 from bevcli.model.ego_motion import rotate_history
-from bevcli.model.official_keys import from_official
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs
 from bevcli.workshop.vad.heads import line_positions

@@ -7,10 +7,10 @@ import original_reference as original
 import torch
 from uniad_rule import uniad_shapes, uniad_tensor, unused_shapes
 
+from bevcli.checkpoints import from_official
 from bevcli.config import load_config
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z, rotation_from_quaternion
 from bevcli.model.encoder import EncoderConfig
-from bevcli.model.official_keys import from_official
 from bevcli.model.resnet import ResNetConfig
 from bevcli.workshop.uniad.uniad import UniAD, UniADConfig
 

@@ -12,8 +12,8 @@ import torch
 from original_reference import DATA, official_shapes
 from stated_rule import rule_tensor
 
+from bevcli.checkpoints import from_official
 from bevcli.config import load_config
-from bevcli.model.official_keys import from_official
 from bevcli.workshop.vad.vad import VAD, VADConfig
 
 STEM_GAIN = 1 / 57

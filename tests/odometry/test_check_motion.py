@@ -27,11 +27,10 @@ from stated_mistakes import (
 )
 
 import bevcli
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.sequences.view import select
+from bevcli.sequences.open import select
 from bevcli.workshop.calibration import calibrate
 from bevcli.workshop.calibration.in_turn import check_motion as check
 from bevcli.workshop.odometry import compare as comparing

@@ -19,8 +19,7 @@ import bevcli
 from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.view import DriveView
+from bevcli.sequences.open import DriveView, open_sequence
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, MotionMeter, measure_motion, measure_steps
 from bevcli.workshop.odometry.step_views import exponential, logarithm
 

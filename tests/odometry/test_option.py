@@ -17,9 +17,8 @@ import bevcli
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import inverse
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.open import open_steps
+from bevcli.sequences.open import DriveView, open_steps
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.view import DriveView
 from bevcli.workshop.batch.job import Job
 from bevcli.workshop.odometry import measure, report
 from bevcli.workshop.odometry.report import MOST_RATE_HZ, at_most_rate, with_measured_motion

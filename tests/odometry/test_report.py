@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from true_motion import STREET, motion_of, street_copy
 
 import bevcli
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply, rigid, rotation_about_z
 from bevcli.sequences.files.ego_motion_file import read_ego_motion

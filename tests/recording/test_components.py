@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from bevcli.recording.components import any_values, components, line_strips, packed, rgb_format, ui_points
+from bevcli.recording.entities import any_values, components, line_strips, packed, rgb_format, ui_points
 
 RANDOM = np.random.default_rng(0)
 POINTS_2D, POINTS_3D = RANDOM.normal(size=(5, 2)), RANDOM.normal(size=(5, 3))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 
 
 @pytest.mark.parametrize("bev", ["norm", "pca", "none", "channel:0", "channel:17"])

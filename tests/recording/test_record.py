@@ -14,13 +14,12 @@ from bevcli.errors import InputError
 from bevcli.frame import BevMap, Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid
-from bevcli.recording import entities
+from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
-from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
-from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
+from bevcli.workshop.formats.submission import write_submission
 from bevcli.workshop.scores.record import names_of, record, record_steps
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 

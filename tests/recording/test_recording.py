@@ -17,8 +17,7 @@ from bevcli.errors import OutputError
 from bevcli.frame import BevMap, CameraImage, NewStart, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
-from bevcli.recording import entities
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 

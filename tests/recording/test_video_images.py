@@ -6,9 +6,9 @@ import pytest
 from memory_drive import MemoryDrive, WithoutImages
 from recorded_drive import record
 
+from bevcli import recording as options
 from bevcli.errors import BevcliError
-from bevcli.recording import entities, options
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions, entities
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.video import RecordedImages
 

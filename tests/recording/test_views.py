@@ -14,7 +14,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
-from bevcli.recording import entities
+from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, frame_rate_hz
 from bevcli.recording.entities import (
     BACKGROUND,
@@ -26,7 +26,6 @@ from bevcli.recording.entities import (
     map_colors,
 )
 from bevcli.recording.log_static import FROM_RENDERED, UNTRAINED, Recorded, legend_entries, ring_distances_m
-from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
 

@@ -8,8 +8,7 @@ import pytest
 from healthy_rigs import HEALTHY, copy_of
 from scipy.spatial.transform import Rotation
 
-from bevcli.errors import InputError, OutputError
-from bevcli.findings import errors_of
+from bevcli.errors import InputError, OutputError, errors_of
 from bevcli.geometry.cameras import CameraRig
 from bevcli.sequences.files.calibration_file import draft_calibration, read_calibration, write_calibration
 

@@ -21,7 +21,7 @@ from mistakes import (
 )
 from scipy.spatial.transform import Rotation
 
-from bevcli.findings import errors_of
+from bevcli.errors import errors_of
 from bevcli.rig import check_calibration
 from bevcli.rig.check_calibration import check_rig
 from bevcli.sequences.files.calibration_file import draft_calibration

@@ -15,7 +15,7 @@ from mistakes import MOTION_MISTAKES, drive, motion_of
 from stated_mistakes import MISTAKES
 
 import bevcli
-from bevcli.findings import errors_of
+from bevcli.errors import errors_of
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.rig.check_calibration import check_calibration, check_camera_times
 from bevcli.rig.coverage import coverage_of

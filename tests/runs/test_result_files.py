@@ -26,9 +26,8 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
 from bevcli.model.step import ModelOutputs
-from bevcli.recording import entities
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import RunOptions
+from bevcli.recording import RecordingOptions, entities
+from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.incremental_json import GrowingFile

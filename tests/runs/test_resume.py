@@ -16,8 +16,8 @@ from bevcli.frame import FrameStamp
 from bevcli.inference.load import Model
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import RunOptions
+from bevcli.recording import RecordingOptions
+from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
 from bevcli.runs.state import load_state, save_state
 from bevcli.runs.summary import Counts

@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig, track
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_in_folder, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 

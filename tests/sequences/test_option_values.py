@@ -3,7 +3,7 @@
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.sequences.native import NativeFolder
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions, RigOptions

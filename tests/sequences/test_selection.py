@@ -16,8 +16,7 @@ from bevcli.frame import DerivedDrive, Drive, DriveFacts, FrameStamp
 from bevcli.geometry.transforms import GeoOrigin
 from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import draft_calibration
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.view import DriveView, select_every, select_range, select_rate
+from bevcli.sequences.open import DriveView, open_sequence, select_every, select_range, select_rate
 from bevcli.workshop.formats.output import NativeWriter
 from bevcli.workshop.trust.faults import ReversedColors
 

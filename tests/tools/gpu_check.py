@@ -37,8 +37,8 @@ from bevcli.inference.load import choose_device, describe_machine
 from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
+from bevcli.model import Precision
 from bevcli.model.network import Network
-from bevcli.model.precision import Precision
 from bevcli.model.prepare import methods_on_device, prepare_for_inference
 from bevcli.model.step import PreparedFrame
 from bevcli.model.temporal_model import TemporalModel

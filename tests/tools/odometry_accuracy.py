@@ -19,12 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.transforms import Array, Pose, inverse
+from bevcli.inference import StepOptions
 from bevcli.inference.load import load_model
-from bevcli.inference.options import StepOptions
 from bevcli.printing import say
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.open import DriveView, open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.view import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
 from bevcli.workshop.training.validation import validate
 

@@ -15,8 +15,8 @@ from bevcli.config import load_config
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose, rigid
+from bevcli.inference import TORCH
 from bevcli.inference.load import Model
-from bevcli.inference.options import TORCH
 from bevcli.workshop.odometry import compare, step_views
 from bevcli.workshop.odometry.measure import measure_steps
 from bevcli.workshop.robustness.conditions import choose_conditions

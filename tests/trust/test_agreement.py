@@ -14,8 +14,7 @@ import bevcli
 from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose

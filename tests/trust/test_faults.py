@@ -7,7 +7,7 @@ import planted_faults
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z

@@ -10,8 +10,7 @@ from rerun.chunk import RrdReader
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import run_python
-from bevcli.recording import entities
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.writer import Recording
 from bevcli.viewer import recording_file
 from bevcli.viewer.recording_file import open_recording

@@ -14,7 +14,7 @@ from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 
 from bevcli.errors import InputError, OutputError
-from bevcli.recording.options import RecordingOptions, has_av
+from bevcli.recording import RecordingOptions, has_av
 from bevcli.recording.writer import Recording
 from bevcli.viewer import native, web
 from bevcli.viewer.native import LOOPBACK, NO_DRIVER, free_port, start_viewer, stop, take_screenshot

@@ -17,7 +17,7 @@ from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
-from bevcli.recording.options import RecordingOptions
+from bevcli.recording import RecordingOptions
 from bevcli.sequences.files.boxes_table import COLUMNS
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop import video

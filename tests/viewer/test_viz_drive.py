@@ -21,8 +21,8 @@ from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.workshop.formats.submission import write_submission
 
 ROOT = Path(__file__).parents[2]
 FRAMES = 3

@@ -21,8 +21,8 @@ from bevcli.checkpoints import bundled_weights
 from bevcli.cli.progress import load_with_bar
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, OutputError, WeightsError
+from bevcli.inference import ModelOptions
 from bevcli.inference.load import load_model
-from bevcli.inference.options import ModelOptions
 from bevcli.model.temporal_model import build_model
 from bevcli.published import all_weights, named_weights, own_table, read_sources
 from bevcli.weights import fetch

@@ -20,9 +20,9 @@ from bevcli.jit import njit
 from bevcli.model import segmentation, upload
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
+from bevcli.model.kernels import rounded_products
 from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, change_classes, has_triton, triton_kernels
 from bevcli.model.kernels.compiled import in_threads
-from bevcli.model.kernels.rounding import rounded_products
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
 from bevcli.model.temporal_model import TemporalModel

@@ -15,7 +15,7 @@ from bevcli.model.backbone import Stage
 from bevcli.model.decoder import RegressionBranch
 from bevcli.model.efficientnet_lite import InvertedResidual, SameConvolution
 from bevcli.model.encoder import FeedForward
-from bevcli.model.kernels.rounding import rounded_products
+from bevcli.model.kernels import rounded_products
 from bevcli.model.nanodet import SLOPE, LeakyConvolution
 from bevcli.model.resnet import BasicBlock, Bottleneck
 

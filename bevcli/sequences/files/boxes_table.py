@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS, Boxes2D
 from bevcli.parsing.documents import cell_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json
 from bevcli.sequences.files.incremental_json import GrowingFile

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding, errors_of
+from bevcli.errors import Finding, InputError, errors_of
 from bevcli.frame import DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin

@@ -7,8 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion
 from bevcli.printing import one_line, quoted
 

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from bevcli.errors import InputError, OutputError
+from bevcli.inference import ModelOptions
 from bevcli.inference.load import Model, choose_device, choose_model, load_model
-from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, spread
+from bevcli.recording import RecordingOptions
 from bevcli.recording.meshes import read_class_meshes
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.folder import folder_lock
-from bevcli.runs.options import RunOptions
+from bevcli.runs import RunOptions
+from bevcli.runs.state import folder_lock
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions

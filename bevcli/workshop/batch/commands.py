@@ -14,10 +14,10 @@ from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.cli.progress import Progress, fetch_with_bar, load_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError, WeightsError
-from bevcli.inference.options import ModelOptions
+from bevcli.inference import ModelOptions
 from bevcli.printing import say
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import RunOptions
+from bevcli.recording import RecordingOptions
+from bevcli.runs import RunOptions
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers

@@ -22,11 +22,11 @@ from msgspec import Meta
 from bevcli._version import __version__
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import Drive
+from bevcli.inference import ModelOptions
 from bevcli.inference.load import Model, load_model
-from bevcli.inference.options import ModelOptions
 from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, hash_of_file, hash_of_values, read_text
-from bevcli.runs.options import RunOptions
+from bevcli.runs import RunOptions
 from bevcli.sequences.format import Format, check_options, drives_in, format_of, formats, is_drive
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of

@@ -29,10 +29,9 @@ from bevcli.inference.load import Model
 from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.parsing.files import is_there
 from bevcli.printing import reason_of, valid_text
-from bevcli.runs.folder import SUMMARY
 from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.runs.state import save_state
-from bevcli.runs.summary import RunSummary
+from bevcli.runs.summary import SUMMARY, RunSummary
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage

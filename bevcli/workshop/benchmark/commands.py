@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from bevcli.cli.bridge import Json, Part
 from bevcli.errors import BevcliError
-from bevcli.inference.options import ModelOptions, complete_model
+from bevcli.inference import ModelOptions, complete_model
 from bevcli.options import option, options
 from bevcli.printing import print_note, say
 from bevcli.registry import known_models

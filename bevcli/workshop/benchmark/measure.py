@@ -22,10 +22,10 @@ from bevcli.inference.load import Model, choose_device, describe_machine, peak_m
 from bevcli.inference.pipeline import write_behind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
+from bevcli.model import Precision
 from bevcli.model.config import ModelConfig
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.precision import Precision
 from bevcli.model.prepare import DTYPES, prepare_for_inference
 from bevcli.printing import counted
 from bevcli.recording.writer import Recording

@@ -20,9 +20,9 @@ from bevcli.frame import CameraImage, Drive, Frame, FrameStamp, Prediction
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, default_ego_from_bev
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
+from bevcli.inference import EXPORTED_SUFFIX, TORCH, ModelOptions
 from bevcli.inference.load import Model, choose_engine, describe_machine, installed_engines, load_model
 from bevcli.inference.machine import keep_freed_memory, return_freed_memory
-from bevcli.inference.options import EXPORTED_SUFFIX, TORCH, ModelOptions
 from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.config import ModelConfig

@@ -12,8 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.frame import Drive, DriveFacts
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from bevcli.cli.progress import Progress
-from bevcli.findings import Finding, errors_of
+from bevcli.errors import Finding, errors_of
 from bevcli.frame import Drive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.printing import say
-from bevcli.sequences.view import DriveView
+from bevcli.sequences.open import DriveView
 from bevcli.workshop.calibration import CalibrateOptions, calibrate as calibration
 from bevcli.workshop.calibration.calibrate import CalibrationResult, calibration_steps
 from bevcli.workshop.calibration.estimates import Verdict, change_text

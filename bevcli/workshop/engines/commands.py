@@ -8,7 +8,7 @@ import typer
 
 import bevcli
 from bevcli.cli.bridge import Part, argument, model_option
-from bevcli.inference.options import FILE_ENGINE, ModelOptions
+from bevcli.inference import FILE_ENGINE, ModelOptions
 from bevcli.options import option, options
 from bevcli.printing import say
 from bevcli.workshop.engines import FileOptions, OnnxOptions

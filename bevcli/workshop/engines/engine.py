@@ -25,18 +25,17 @@ from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.frame import Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
+from bevcli.inference import ModelOptions
 from bevcli.inference.load import Model, tracker_of_table
-from bevcli.inference.options import ModelOptions
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.model import AnyPrecision
 from bevcli.model.config import ModelConfig
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
-from bevcli.model.precision import AnyPrecision
 from bevcli.model.temporal_model import model_class
 from bevcli.parsing.files import MIB, hash_of_values, read_bytes
 from bevcli.sequences.images import AT_REST
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.view import select_range
+from bevcli.sequences.open import open_sequence, select_range
 from bevcli.workshop.engines import OnnxOptions
 from bevcli.workshop.engines.export_form import DeformableConvolution
 from bevcli.workshop.engines.export_onnx import (

@@ -26,8 +26,8 @@ from bevcli.config import as_table, config_of_table
 from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.frame import Drive
 from bevcli.inference.preprocess import Preprocessor
+from bevcli.model import AnyPrecision
 from bevcli.model.config import ModelConfig
-from bevcli.model.precision import AnyPrecision
 from bevcli.model.temporal_model import TemporalModel, model_class
 from bevcli.options import gather
 from bevcli.parsing.documents import parse_json

@@ -14,8 +14,8 @@ from bevcli.errors import BevcliError, WeightsError
 from bevcli.frame import BevMap, Drive, FrameResult
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
+from bevcli.inference import FILE_ENGINE, ModelOptions
 from bevcli.inference.load import Model, load_model
-from bevcli.inference.options import FILE_ENGINE, ModelOptions
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.prepare import prepare_for_inference

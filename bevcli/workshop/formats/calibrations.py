@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.options import named

@@ -8,11 +8,11 @@ from bevcli.options import gather
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes, write_boxes
 from bevcli.sequences.files.boxes_table import write_csv
-from bevcli.sequences.files.submission import write_submission
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import read_recording
 from bevcli.workshop.formats import ExportOptions
 from bevcli.workshop.formats.kitti import export_kitti
+from bevcli.workshop.formats.submission import write_submission
 from bevcli.writing import check_output
 
 # Format -> the name of the file or folder that is written next to the boxes by default.

@@ -24,7 +24,7 @@ from bevcli.parsing.documents import CsvRow, name_of
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted
 from bevcli.sequences.files.boxes_file import count_classes
-from bevcli.sequences.view import scenes_of
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
 from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment, check_labels

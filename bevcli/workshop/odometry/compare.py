@@ -11,13 +11,12 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.frame import Drive
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
-from bevcli.sequences.view import DriveView
+from bevcli.sequences.open import DriveView
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.workshop.odometry.stated import FREEDOMS, MeasuredSteps, Poses, mistakes, steps_between, turn_between
 

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.frame import Drive
 from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.printing import aligned, counted
-from bevcli.sequences.view import DriveView, select, select_rate
+from bevcli.sequences.open import DriveView, select, select_rate
 from bevcli.workshop.formats.output import write_ego_motion
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
 from bevcli.writing import write_whole

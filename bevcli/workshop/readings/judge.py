@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bevcli.errors import InputError
-from bevcli.findings import Finding
+from bevcli.errors import Finding, InputError
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.options import named
 from bevcli.sequences.files.calibration_file import CONTRADICTED, RigDraft

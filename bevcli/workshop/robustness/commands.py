@@ -12,7 +12,7 @@ from bevcli.cli.bridge import FormatValues, Json, Part, argument
 from bevcli.cli.progress import Progress, load_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
-from bevcli.inference.options import ModelOptions
+from bevcli.inference import ModelOptions
 from bevcli.printing import print_note, say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.robustness import StressOptions, StressOutputOptions

@@ -17,7 +17,7 @@ from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, camera_pose_noise
 from bevcli.geometry.ego_motion import motion_during
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.sequences.view import select
+from bevcli.sequences.open import select
 from bevcli.workshop.robustness import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels

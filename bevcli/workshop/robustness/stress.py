@@ -13,16 +13,15 @@ from bevcli.errors import InputError, OutputError
 from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import DetectionConfig
+from bevcli.inference import StepOptions
 from bevcli.inference.load import Model
-from bevcli.inference.options import StepOptions
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import read_json
 from bevcli.printing import aligned
-from bevcli.runs.folder import RunFolder
-from bevcli.runs.state import DIGITS, digest, load_state, run_fingerprint, save_state, saved_state
+from bevcli.runs.state import DIGITS, RunFolder, digest, load_state, run_fingerprint, save_state, saved_state
+from bevcli.sequences.open import DriveView, scenes_of, select, select_range
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.view import DriveView, scenes_of, select, select_range
 from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness import StressOptions
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions

@@ -15,13 +15,13 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
 from bevcli.sequences.files.boxes_file import BoxesFile, ClassNames, FrameBoxes, read_boxes
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
-from bevcli.sequences.files.submission import is_submission, read_submission
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
 from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
 from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.formats.submission import is_submission, read_submission
 from bevcli.workshop.scores.detection import DetectionScores
 
 

@@ -11,12 +11,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.printing import counted
+from bevcli.recording import RecordingOptions
 from bevcli.recording.log_static import RecordedBoxes
-from bevcli.recording.options import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.sequences.open import open_sequence
-from bevcli.sequences.view import count_labels
+from bevcli.sequences.open import count_labels, open_sequence
 from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 
 MOST = 2  # models: each has a colour

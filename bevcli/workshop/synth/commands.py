@@ -6,12 +6,12 @@ from typing import Annotated, Any
 from bevcli.cli.bridge import argument
 from bevcli.cli.progress import Progress
 from bevcli.cli.run import run
-from bevcli.inference.options import ModelOptions
+from bevcli.inference import ModelOptions
 from bevcli.printing import counted, say
-from bevcli.recording.options import RecordingOptions
-from bevcli.runs.options import OutputOptions, RunOptions
+from bevcli.recording import RecordingOptions
+from bevcli.runs import OutputOptions, RunOptions
 from bevcli.sequences.options import InputOptions
-from bevcli.viewer.options import ViewOptions
+from bevcli.viewer import ViewOptions
 from bevcli.workshop.synth import DemoOptions, RenderOptions
 
 PANEL = "Start"

@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from bevcli.inference.options import complete_model
+from bevcli.inference import complete_model
 from bevcli.options import option, options, parse_pairs
 from bevcli.workshop.scores import MAX_RANGE_HELP
 

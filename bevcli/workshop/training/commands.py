@@ -12,9 +12,9 @@ from bevcli.cli.bridge import Json, Part, model_option
 from bevcli.cli.progress import Progress, last_of_steps
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
-from bevcli.inference.options import ModelOptions, StepOptions
+from bevcli.inference import ModelOptions, StepOptions
 from bevcli.printing import counted, print_note, say
-from bevcli.runs.options import RunOptions
+from bevcli.runs import RunOptions
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.training import ModelFileOptions, TrainOptions, ValidationOptions
 

@@ -21,7 +21,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
-from bevcli.runs.folder import OWN, folder_lock
+from bevcli.runs.state import OWN, folder_lock
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering

@@ -26,9 +26,8 @@ from bevcli.inference.load import peak_memory
 from bevcli.inference.training_rigs import fov_deg, tilt_deg
 from bevcli.model.config import BevFrameConfig
 from bevcli.printing import counted, duration
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.view import scenes_of, select_rate
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.training import Preset, TrainOptions

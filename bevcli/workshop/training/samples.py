@@ -37,7 +37,7 @@ from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
 from bevcli.model.upload import pinned, tensors_in, upload
 from bevcli.printing import counted
-from bevcli.sequences.view import scenes_of
+from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
 from bevcli.workshop.training.augmentation import (
     UNDISTORTED,

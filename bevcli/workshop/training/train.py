@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from bevcli.inference import ModelOptions, StepOptions
 from bevcli.inference.load import Model, choose_device, choose_model, load_model
-from bevcli.inference.options import ModelOptions, StepOptions
 from bevcli.model.config import ModelConfig
 from bevcli.options import refuse, spread
 from bevcli.workshop.synth import DriveOptions

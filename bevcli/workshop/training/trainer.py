@@ -20,8 +20,7 @@ from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner, StepOptions
 from bevcli.inference.training_rigs import weights_facts
-from bevcli.model.kernels.rounding import rounded_products
-from bevcli.model.kernels.training import choose_training_kernels
+from bevcli.model.kernels import rounded_products
 from bevcli.model.network import Network
 from bevcli.parsing.pth import read_pth
 from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
@@ -29,6 +28,7 @@ from bevcli.workshop.training.augmentation import randomised
 from bevcli.workshop.training.clip_steps import FrozenStages, Lesson, Teacher, forward_clip
 from bevcli.workshop.training.frame_losses import FrameLosses
 from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob
+from bevcli.workshop.training.kernels import choose_training_kernels
 from bevcli.workshop.training.samples import Batch, BatchMaker, loaded_batches
 from bevcli.workshop.training.validation import LearningCurve, Validation, draw_learning_curves, event_writer, validate
 from bevcli.writing import whole_file, write_whole

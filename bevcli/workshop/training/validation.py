@@ -28,7 +28,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import MIB, read_text
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
-from bevcli.sequences.view import count_labels, scenes_of
+from bevcli.sequences.open import count_labels, scenes_of
 from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, boxes_ego, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs

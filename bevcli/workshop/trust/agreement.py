@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.scores.evaluate import finite

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from bevcli.findings import Finding
+from bevcli.errors import Finding
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.points import matched

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from bevcli.frame import Drive, Frame, Prediction
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.inference.load import Model
 from bevcli.inference.run import run

@@ -13,16 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.findings import Finding, errors_of
+from bevcli.errors import Finding, errors_of
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.transforms import Array
+from bevcli.inference import TORCH
 from bevcli.inference.load import Model
-from bevcli.inference.options import TORCH
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
-from bevcli.sequences.view import select
+from bevcli.sequences.open import select
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.step_views import Viewer

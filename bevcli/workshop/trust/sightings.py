@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from bevcli.frame import Frame
-from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import BOX_EDGES, Boxes2D, Boxes3D
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import Array, apply, inverse

@@ -16,7 +16,7 @@ from bevcli.checkpoints import bundled_weights, read_safetensors
 from bevcli.config import load_config
 from bevcli.errors import InputError
 from bevcli.frame import Frame
-from bevcli.geometry.boxes2d import Boxes2D
+from bevcli.geometry.boxes import Boxes2D
 from bevcli.inference.image_boxes import camera_boxes
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.nanodet import NanoDet, NanoDetConfig

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bevcli.checkpoints import OfficialNames, Renames
 from bevcli.errors import BevcliError, ConfigError
 from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.boxes import Boxes3D
@@ -17,7 +18,6 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import ObjectQueries, boxes_of_codes
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.network import STAGES
-from bevcli.model.official_keys import OfficialNames, Renames
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import upload, without_autocast

@@ -11,11 +11,11 @@ from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.main import PlainCommand
 from bevcli.cli.progress import fetch_with_bar
 from bevcli.errors import OutputError
-from bevcli.inference.options import ModelOptions
+from bevcli.inference import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, print_note, say
 from bevcli.registry import is_of_hub
-from bevcli.weights.options import ModelFileOptions, PackOptions
+from bevcli.weights import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -96,7 +96,7 @@ def inspect(
     number of their parameters.
     """
     from bevcli import checkpoints, config as configs
-    from bevcli.model.parts import model_parts, parts_as_text
+    from bevcli.workshop.weights.model_file import model_parts, parts_as_text
 
     if file is None and model is None:
         raise typer.BadParameter("give FILE, or --model NAME, or both")
@@ -146,7 +146,7 @@ def model_file(
 
     `bevcli run SEQUENCE --model FILE.toml --weights WEIGHTS` takes it then.
     """
-    from bevcli.weights.model_file import model_file_for
+    from bevcli.workshop.weights.model_file import model_file_for
 
     config, model = model_file_for(weights, out, options)
     say(f"{out}: {model} with {counted(len(config.classes), 'classes')}: {', '.join(config.classes)}")
