@@ -28,25 +28,17 @@ from bevcli.workshop.formats.matching import FARTHEST, CameraImages, frames_at
 
 # Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
 # and STROLLER, stay as they are, and are not scored.
-CLASS_OF_CATEGORY = {
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "VEHICULAR_TRAILER": "trailer",
-    "MESSAGE_BOARD_TRAILER": "trailer",
-    "TRAFFIC_LIGHT_TRAILER": "trailer",
-    "MOTORCYCLE": "motorcycle",
-    "BICYCLE": "bicycle",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "traffic_cone",
+CATEGORIES_OF_CLASS = {
+    "car": ("REGULAR_VEHICLE",),
+    "truck": ("LARGE_VEHICLE", "BOX_TRUCK", "TRUCK", "TRUCK_CAB"),
+    "bus": ("BUS", "SCHOOL_BUS", "ARTICULATED_BUS"),
+    "trailer": ("VEHICULAR_TRAILER", "MESSAGE_BOARD_TRAILER", "TRAFFIC_LIGHT_TRAILER"),
+    "motorcycle": ("MOTORCYCLE",),
+    "bicycle": ("BICYCLE",),
+    "pedestrian": ("PEDESTRIAN", "OFFICIAL_SIGNALER"),
+    "traffic_cone": ("CONSTRUCTION_CONE", "CONSTRUCTION_BARREL"),
 }
+CLASS_OF_CATEGORY = {name: class_name for class_name, names in CATEGORIES_OF_CLASS.items() for name in names}
 LARGEST_BYTES = 256 * MIB
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3

@@ -15,36 +15,22 @@ VISIBILITIES = {"full": 1.0, "most": 0.75, "partial": 0.3, "none": 0.05}
 
 # Class names; docs/other-inputs.md says what is lost. Older datasets have the longer names. Names are compared without
 # case; others stay as they are, and are not scored.
-CLASS_OF_CATEGORY = {
-    "vehicle.car": "car",
-    "police_car": "car",
-    "vehicle.police": "car",
-    "vehicle.emergency (ambulance & police)": "car",
-    "ambulance": "truck",
-    "vehicle.ambulance": "truck",
-    "fire_truck": "truck",
-    "vehicle.fire": "truck",
-    "vehicle.truck": "truck",
-    "forklift": "construction_vehicle",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.bus": "bus",
-    "vehicle.bus (bendy & rigid)": "bus",
-    "vehicle.trailer": "trailer",
-    "semi_trailer": "trailer",
-    "motorbike": "motorcycle",
-    "vehicle.motorbike": "motorcycle",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.bicycle": "bicycle",
-    "construction_worker": "pedestrian",
-    "police_officer": "pedestrian",
-    "pedestrian.adult": "pedestrian",
-    "pedestrian.child": "pedestrian",
-    "pedestrian.construction_worker": "pedestrian",
-    "pedestrian.police_officer": "pedestrian",
-    "movable_object.barrier": "barrier",
-    "movable_object.trafficcone": "traffic_cone",
-    "movable_object.traffic_cone": "traffic_cone",
-}
+CATEGORIES_OF_CLASS = {
+    "car": ("vehicle.car", "police_car", "vehicle.police", "vehicle.emergency (ambulance & police)"),
+    "truck": ("ambulance", "vehicle.ambulance", "fire_truck", "vehicle.fire", "vehicle.truck"),
+    "construction_vehicle": ("forklift", "vehicle.construction"),
+    "bus": ("vehicle.bus", "vehicle.bus (bendy & rigid)"),
+    "trailer": ("vehicle.trailer", "semi_trailer"),
+    "motorcycle": ("motorbike", "vehicle.motorbike", "vehicle.motorcycle"),
+    "bicycle": ("vehicle.bicycle",),
+    "pedestrian": (
+        "construction_worker", "police_officer", "pedestrian.adult", "pedestrian.child",
+        "pedestrian.construction_worker", "pedestrian.police_officer",
+    ),
+    "barrier": ("movable_object.barrier",),
+    "traffic_cone": ("movable_object.trafficcone", "movable_object.traffic_cone"),
+}  # fmt: skip
+CLASS_OF_CATEGORY = {name: class_name for class_name, names in CATEGORIES_OF_CLASS.items() for name in names}
 
 
 def open_t4(path: Path, common: InputOptions, options: Format) -> TableDrive:
