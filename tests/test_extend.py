@@ -88,12 +88,6 @@ def test_help_lists_the_command_of_the_page(folder):
     assert "--skip" in bevcli(folder, "run", "--help")
 
 
-def test_a_formats_option_is_one_line(folder):
-    assert sum("skip: int" in line for line in FILES["bevcli_ground/drive_file.py"].splitlines()) == 1
-    code = "import bevcli; print(len(bevcli.open_sequence('street.drive.json', skip=1).stamps))"
-    assert python(folder, "-c", code) == "2\n"
-
-
 @pytest.mark.slow
 def test_the_engine_of_the_page_runs_an_exported_file(folder):
     pytest.importorskip("onnxruntime")

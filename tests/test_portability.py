@@ -3,11 +3,9 @@
 import pwd
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import bevcli
 from bevcli.published import own_table, read_sources
 from bevcli.writing import user_cache
 
@@ -34,29 +32,6 @@ assert peak_memory(torch.device("cpu")) == 0
 def test_every_module_is_imported_without_posix() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_POSIX], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
-
-
-ROOT = Path(bevcli.__file__).parent
-
-
-@pytest.mark.slow
-def test_importing_the_core_loads_no_workshop():
-    """Beside its names. `bevcli.calibrate` and `bevcli.render` are texts, imported when they are used."""
-    files = [path.relative_to(ROOT).with_suffix("") for path in sorted(ROOT.rglob("*.py"))]
-    modules = [".".join(("bevcli", *path.parts)).removesuffix(".__init__") for path in files]
-    left_out = (
-        "bevcli.workshop",
-        "bevcli.__main__",
-        "bevcli.model.kernels.triton_",
-        "bevcli.recording.av1",
-    )  # for optional packages
-    core = [module for module in modules if not module.startswith(left_out)]
-    code = (
-        f"import importlib, sys\nfor name in {core}:\n    importlib.import_module(name)\n"
-        "print(*(name for name in sys.modules if name.startswith('bevcli.workshop.')))"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert not found
 
 
 def test_a_user_without_a_home_has_folders_that_are_not_there(monkeypatch):

@@ -31,14 +31,6 @@ def test_the_commands_run(clone: Path, first: bool) -> None:
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
-def test_how_far_official_weights_are_tested_is_said_once() -> None:
-    """The first claim on them links to it."""
-    text = (ROOT / "README.md").read_text()
-    assert len(re.findall(r"not (?:been )?(?:tested|tried)", text + (ROOT / "docs/weights.md").read_text())) == 1
-    claim = next(line for line in text.splitlines() if "official weight" in line)
-    assert "(docs/weights.md#what-was-verified)" in claim
-
-
 def test_the_python_example_writes_a_recording(clone: Path) -> None:
     [example] = blocks("python")
     with contextlib.chdir(clone):

@@ -53,7 +53,3 @@ def test_the_service_draws_what_it_is_sent(service):
         status, text = post(server.server_port, body)
         assert (status, len(text.decode().splitlines())) == (400, 1), body
     server.shutdown()
-
-
-def test_the_page_of_the_service_fits_on_a_screen():
-    assert len(PAGE.splitlines()) <= 64

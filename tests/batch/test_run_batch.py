@@ -113,16 +113,6 @@ def test_drives_that_are_not_scored_have_their_agreement(batch, tmp_path, monkey
     assert (row["agreement"], row["agreement_low"], row["agreement_high"]) == (0.5123, 0.4, None)
 
 
-@pytest.mark.slow
-def test_a_second_batch_with_resume_does_nothing(batch, tmp_path):
-    batch()
-    before = times(tmp_path / "out")
-    ran = []
-    summary = batch(resume=True, ran=ran)
-    assert (summary.skipped, summary.failed, ran) == (4, 1, [])
-    assert times(tmp_path / "out") == before
-
-
 def test_failed_drives_run_again_on_request_or_once_mended(batch, tmp_path):
     drives = tmp_path / "drives"
     write_drive(drives / "good", 1)

@@ -6,15 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from interrupted import run_frames
 from memory_drive import MemoryDrive, WithoutImages
 from stepping import CPU, run
 
 from bevcli.geometry.transforms import Pose, inverse
-from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
-from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.workshop.bevformer_v2.window import fill_window, other_bev_from_bev
 
 
@@ -202,13 +199,3 @@ def test_the_bev_frame_moves_with_the_vehicle():
         )
         expected = inverse(then.matrix @ ego_from_bev) @ now.matrix @ ego_from_bev
         assert other_bev_from_bev(now, then, ego_from_bev) == pytest.approx(expected, abs=1e-5)
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_is_resumed_with_its_window(window_model, tmp_path):
-    model = Model(window_model(-1, 0, 1))
-    run_into_folder(model, MemoryDrive(5), tmp_path / "whole")
-    run_frames(4, model, MemoryDrive(5), tmp_path / "cut")
-    run_into_folder(model, MemoryDrive(5), tmp_path / "cut", resume=True)
-    for name in ("predictions.json", "tracks.csv"):
-        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -1,8 +1,6 @@
 """What a recording holds, read back from the file."""
 
 import gc
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -266,26 +264,6 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     recording = Recording(tmp_path / "no" / "r.rrd", drive, NamedModel())
     with pytest.raises(OutputError, match=r"r\.rrd"), recording:
         pass
-
-
-@pytest.mark.slow
-def test_every_frame_survives_a_crash(tmp_path):
-    script = f"""
-import os, sys
-sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
-from memory_drive import MemoryDrive
-from recorded_drive import NamedModel, predict
-from bevcli.recording.writer import Recording
-drive = MemoryDrive(4)
-with Recording({str(tmp_path / "r.rrd")!r}, drive, NamedModel()) as r:
-    for place in range(3):
-        r.log(drive.load(place), predict(drive.load(place)))
-    os._exit(9)  # as a crash does: nothing is closed
-"""
-    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 9
-    frames = list(RecordingReader(tmp_path / "r.rrd").frames())
-    assert [frame.index for frame in frames] == [0, 1, 2]
-    assert all(frame.values(entities.BOXES, "name") == ["car", "pedestrian"] for frame in frames)
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted on Linux")

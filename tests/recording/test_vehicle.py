@@ -1,8 +1,6 @@
 """The ego vehicle's mesh: from files of several formats, and the default car."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import PIL.Image
@@ -181,16 +179,6 @@ def test_a_mesh_in_millimetres_is_an_error(tmp_path, in_this_process):
     van().apply_scale(1000).export(tmp_path / "van.stl")
     with pytest.raises(InputError, match="5000 x 2000 x 2000 m"):
         load_vehicle(tmp_path / "van.stl")
-
-
-@pytest.mark.slow
-def test_the_default_car_is_drawn_without_trimesh(tmp_path):
-    code = (
-        "import sys, bevcli.recording.writer\n"
-        "from bevcli.recording.meshes import default_vehicle\n"
-        "default_vehicle(); print('trimesh' in sys.modules)"
-    )
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 
 def test_the_default_car_stands_on_the_ground_and_faces_forward():

@@ -106,20 +106,6 @@ def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finis
     assert_equals(out, whole)
 
 
-@pytest.mark.slow
-def test_a_run_may_be_interrupted_after_every_frame(model, whole, tmp_path):
-    out = tmp_path / "out"
-    for broken in range(2, FRAMES):
-        with pytest.raises(KeyboardInterrupt):
-            run_all(model, out, MadeDrive(broken=broken), resume=broken > 2)
-        assert len(read_boxes(out / "predictions.json").frames) == broken
-    for done in (FRAMES - 1, FRAMES):
-        with stepped(model, out, resume=True) as running:
-            assert running.done == done
-            assert len(list(running.frames)) == FRAMES - done
-    assert_equals(out, whole)
-
-
 def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
     calls = []
 

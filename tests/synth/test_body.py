@@ -109,13 +109,6 @@ def test_unstated_motion_shows_in_images_but_not_in_poses(moving, pitched, asset
     assert np.abs(moving.ego_motion().quaternions[:, 1:3]).max() > 1e-3
 
 
-@pytest.mark.slow
-def test_a_still_body_is_the_drive_without_the_option(drive, frame, assets):
-    still = drive_with("still", assets).frame(9)
-    assert all(np.array_equal(still.images[name], image) for name, image in frame.images.items())
-    assert np.array_equal(still.world_from_ego.matrix, frame.world_from_ego.matrix)
-
-
 def test_a_share_of_the_drives_of_a_training_moves():
     some = RigDistribution(moving_share=0.6)
     drawn = [draw_rig(some, seed, (160, 90)) for seed in range(400)]

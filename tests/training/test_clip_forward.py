@@ -17,12 +17,10 @@ from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.training import TrainOptions
-from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
-from bevcli.workshop.training.job import OptimizerConfig, ProcessGroup, TrainingConfig, TrainingJob, prepare_training
+from bevcli.workshop.training.job import ProcessGroup, TrainingConfig, prepare_training
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig
-from bevcli.workshop.training.trainer import Trainer
 
 V1 = replace(CONFIG, heads=("detection",))
 WINDOW = BEVFormerV2Config(
@@ -85,15 +83,6 @@ def test_the_earlier_frame_of_a_window_counts_without_gradient() -> None:
     assert batch.inputs[1].images.grad.any()
 
 
-def trained(out: Path, settings: TrainingConfig, *, resume: bool = False) -> Trainer:
-    """A training of a BEVFormerV2."""
-    out.mkdir(exist_ok=True)
-    torch.manual_seed(0)
-    # With "last", only the second frame of a drive is trained on, so that only it may be scored.
-    drives = PaintedDrives(settings.clips.batch, all_labelled=settings.clips.learn == "all")
-    return Trainer(TrainingJob(BEVFormerV2(WINDOW), settings, drives, drives, out, CPU), resume=resume)
-
-
 SHORT = TrainingConfig(
     steps=3,
     held_out=0,
@@ -102,23 +91,6 @@ SHORT = TrainingConfig(
     clips=ClipConfig(2, 2, 0.0),
     perspective_loss=PerspectiveLossConfig(1.0),
 )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("learn", ["last", "all"])
-def test_resumed_training_with_a_window_equals_an_uninterrupted(tmp_path: Path, learn: str) -> None:
-    settings = replace(SHORT, clips=replace(SHORT.clips, learn=learn))
-    whole = trained(tmp_path / "whole", settings)
-    list(whole.run())
-    named = dict(whole.trained.named_parameters())
-    assert [name for name, one in named.items() if one.grad is None or not one.grad.any()] == []
-
-    next(progress for progress in trained(tmp_path / "killed", settings).run() if progress.loss is None)
-    resumed = trained(tmp_path / "killed", settings, resume=True)
-    assert resumed.done == 1
-    list(resumed.run())
-    pairs = zip(whole.trained.state_dict().values(), resumed.trained.state_dict().values(), strict=True)
-    assert all(torch.equal(one, other) for one, other in pairs)
 
 
 def test_a_window_that_clips_cannot_fill_is_rejected(tmp_path: Path) -> None:
@@ -142,23 +114,6 @@ def test_published_windows_train_with_perspective_supervision(name: str) -> None
 def test_a_job_of_a_window_is_prepared_from_a_model_file(tmp_path: Path) -> None:
     job = prepare_training("v2-t1", CPU, DriveOptions(rendered=(0, 1, 2, 3)), TrainOptions(tmp_path / "out"))
     assert isinstance(job.model, BEVFormerV2)
-
-
-@pytest.mark.slow
-def test_four_clips_can_be_overfitted_with_a_window(tmp_path: Path) -> None:
-    settings = replace(
-        SHORT,
-        steps=350,
-        evaluate_every=350,
-        checkpoint_every=350,
-        clips=ClipConfig(frames=2, batch=4, short_share=0.0),
-        augmentation=AugmentationConfig(0, 0),
-        optimizer=OptimizerConfig(learning_rate=1e-3, backbone_share=1.0, warm_up_steps=50),
-    )
-    list(trained(tmp_path, settings).run())
-    header, last = (tmp_path / "validation.csv").read_text().splitlines()
-    scores = dict(zip(header.split(","), map(float, last.split(",")), strict=True))
-    assert scores["mAP"] > 0.8
 
 
 def made_backbone() -> ResNet:

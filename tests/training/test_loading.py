@@ -4,7 +4,6 @@ The drawing of clips.
 """
 
 import pickle
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -72,22 +71,6 @@ def test_batches_are_equal_for_any_number_of_loaders(loaders: int) -> None:
         for turn, batch in zip(turns, batches, strict=True):
             assert batch.inputs[0].images.dtype == torch.uint8
             assert_equal(batch, made(*turn))
-
-
-@pytest.mark.slow
-def test_processes_take_the_work_off_the_training() -> None:
-    """The processor time of this process, which launches the kernels of a GPU; not the time by the clock, which tells
-    more about the machine."""
-    turns, made, seconds = [(0, turn) for turn in range(12)], maker(in_bytes=True), []
-    for loaders in (1, 2):
-        with closing(loaded_batches(made, turns, loaders)) as batches:
-            for _ in range(3):
-                next(batches)
-            began, clock = time.process_time(), time.perf_counter()
-            count = len(list(batches))
-            seconds.append((time.process_time() - began) / count)
-            print(f"{loaders} loaders: {count / (time.perf_counter() - clock):.0f} batches a second")
-    assert seconds[1] < seconds[0] / 2
 
 
 def test_a_clip_is_the_same_alone_and_in_its_batch() -> None:

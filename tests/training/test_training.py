@@ -109,15 +109,6 @@ def test_a_signal_requests_a_stop(number: int, exit_code: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_seed_reproduces_and_another_one_differs(two_steps: Trainer, tmp_path: Path) -> None:
-    again, other = (trainer(tmp_path / str(seed), seed, settings=TWO_STEPS) for seed in (0, 1))
-    list(again.run())
-    list(other.run())
-    assert_same_weights(two_steps, again)
-    assert_same_weights(two_steps, other, same=False)
-
-
-@pytest.mark.slow
 def test_the_number_of_loaders_changes_nothing(two_steps: Trainer, tmp_path: Path) -> None:
     assert TWO_STEPS.loaders != 3
     three = trainer(tmp_path, settings=replace(TWO_STEPS, loaders=3))
