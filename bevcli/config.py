@@ -173,13 +173,13 @@ def _value(value: Any, hint: Any, file: str, key: str) -> Any:
     kinds: dict[str, Any] = {member.kind: member for member in typing.get_args(hint) if hasattr(member, "kind")}
     if kinds and isinstance(value, dict):
         kind = value.get("kind", next(iter(kinds)))
-        if kind not in kinds:
+        if kind not in [*kinds]:  # a list or a table has no hash
             raise ConfigError(f'{file}: "{key}.kind" must be {_describe(Literal[*kinds])}, but is {kind!r:.60}')
         return _dataclass(value, kinds[kind], file, f"{key}.")
     if typing.get_origin(hint) is Mapping and isinstance(value, dict):
         return {name: _value(item, typing.get_args(hint)[1], file, f"{key}.{name}") for name, item in value.items()}
     try:
-        if _is_finite(value):
+        if not kinds and _is_finite(value):
             return msgspec.convert(value, hint)
     except msgspec.ValidationError:
         pass
@@ -199,7 +199,7 @@ def _describe(hint: Any) -> str:
     if origin is Literal:
         return " or ".join(f'"{argument}"' for argument in arguments)
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(_describe(argument) for argument in arguments if argument is not type(None))
+        return " or ".join(dict.fromkeys(_describe(argument) for argument in arguments if argument is not type(None)))
     if origin is tuple:
         if arguments[-1] is Ellipsis:
             return f"a list, each element {_describe(arguments[0])}"

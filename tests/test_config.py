@@ -177,6 +177,21 @@ def test_the_error_for_a_file_that_is_not_text_names_the_file(tmp_path: Path) ->
         load_config(path)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("backbone", 3, '"backbone" must be a table, but is 3'),
+        ("backbone", {"kind": []}, '"backbone.kind" must be "resnet" or '),
+        ("image_detector", {"kind": {}}, '"image_detector.kind" must be "nanodet", but is {}'),
+        ("hybrid_queries", {"count": 5, "features": 64}, "features must be the channels of the detector's maps, 128"),
+    ],
+)
+def test_a_wrong_table_of_a_model_is_named(key: str, value: object, message: str) -> None:
+    contents = as_table(load_config("photographs"))
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        config_of_table({**contents, key: value}, "car.toml")
+
+
 def test_the_architecture_of_a_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     text = (Path(__file__).parents[1] / "bevcli" / "configs" / "v2-t2.toml").read_text()

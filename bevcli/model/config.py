@@ -17,7 +17,7 @@ from bevcli.model.fpn import FPNConfig
 from bevcli.model.hybrid_queries import HybridQueriesConfig
 from bevcli.model.image_boxes import IMAGE_CLASSES
 from bevcli.model.image_tokens import ImageTokensConfig
-from bevcli.model.nanodet import NanoDetConfig
+from bevcli.model.nanodet import CHANNELS, NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
 
@@ -220,6 +220,8 @@ class ModelConfig:
         object_classes(self.classes, self.class_settings)
         if self.hybrid_queries.count and self.detector is None:
             raise ValueError('hybrid_queries needs image_detector, or a backbone that is a detector, such as "nanodet"')
+        if self.hybrid_queries.count and self.hybrid_queries.features not in self.detector.output_channels():
+            raise ValueError(f"hybrid_queries.features must be the channels of the detector's maps, {CHANNELS}")
         smaller, whole = self.backbone_scale
         if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
             raise ValueError("backbone_scale must be at most 1, and image.pad_divisor times it a whole number")
