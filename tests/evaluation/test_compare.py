@@ -138,6 +138,13 @@ def test_the_range_is_the_one_that_both_have(tmp_path: Path, files: tuple[Path, 
     assert both.nd_score.values == pytest.approx(alone)
 
 
+@pytest.mark.parametrize("end", ["12", 0, -1.0, True, [12.0]])
+def test_a_range_that_is_none_is_named(files: tuple[Path, Path, Path], end: object) -> None:
+    files[0].write_text(json.dumps(json.loads(files[0].read_text()) | {"range_m": end}))
+    with pytest.raises(InputError, match='"range_m" must be a distance above 0 in metres'):
+        bevcli.evaluate(files[0], files[2])
+
+
 def test_only_classes_of_both_are_compared(tmp_path: Path, files: tuple[Path, Path, Path]) -> None:
     """A has nuScenes' ten classes, B has cars up to 15 m, and a class of its own."""
 

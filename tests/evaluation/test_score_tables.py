@@ -11,9 +11,9 @@ from test_eval_command import evaluated, tracked_files, write_frames
 from typer.testing import CliRunner
 
 from bevcli.cli.main import app
-from bevcli.errors import InputError
+from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import Pose
-from bevcli.workshop.scores.tables import Table
+from bevcli.workshop.scores.tables import Table, write_csv, write_latex
 
 __all__ = ["tracked_files"]  # a fixture
 
@@ -75,6 +75,18 @@ def test_a_table_is_printed_and_written() -> None:
     ]
     assert r"{*}a\_b \& c & 2 & 0.3 & -0.500 to - \\" in table.latex()
     assert table.latex().endswith("\\bottomrule\n\\end{tabular}\n\\par (50 \\%)\n")
+
+
+@pytest.mark.parametrize("write", [write_csv, write_latex])
+def test_a_table_replaces_tables_only(tmp_path: Path, write) -> None:
+    table, path = Table("t", ("name", "AP"), [("=a", 0.5)]), tmp_path / "file"
+    write([table], path)
+    write([table], path)
+    assert write is write_latex or "t,'=a,AP,0.5" in path.read_text()  # a spreadsheet would compute =a
+    path.write_text("timestamp_ns,x,y\n")  # of a drive
+    with pytest.raises(OutputError, match="is there, and is no table of scores"):
+        write([table], path)
+    assert path.read_text() == "timestamp_ns,x,y\n"
 
 
 def test_two_tables_do_not_go_into_one_file(tmp_path: Path, tracked_files: tuple[Path, Path]) -> None:

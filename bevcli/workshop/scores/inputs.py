@@ -13,7 +13,9 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid, rotation_about_z
+from bevcli.printing import quoted
 from bevcli.sequences.files.boxes_file import BoxesFile, ClassNames, FrameBoxes, read_boxes
+from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
 from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
@@ -41,7 +43,7 @@ class ScoredInput:
     def range_m(self) -> float | None:
         """Distance to the end of the BEV grid of the model that made the predictions, metres; None if not stated."""
         range_m = self.boxes.extras.get("range_m")
-        return float(range_m) if isinstance(range_m, (int, float)) and range_m > 0 else None
+        return None if range_m is None else float(range_m)
 
 
 def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> ScoredInput:
@@ -52,6 +54,10 @@ def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> 
     """
     file = path / "predictions.json" if path.is_dir() else path
     boxes = read_submission(file) if is_submission(file) else read_boxes(file, class_map)
+    if (range_m := boxes.extras.get("range_m")) is not None:
+        metres = array_of_numbers(range_m)
+        if metres is None or metres.shape or not metres > 0:
+            raise InputError(f'{file}: "range_m" must be a distance above 0 in metres, but is {quoted(range_m)}')
     for frame in boxes.frames:
         if len(frame.boxes) and frame.boxes.scores is None:
             raise InputError(

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
+from bevcli.errors import OutputError
+from bevcli.parsing.documents import cell_of
+from bevcli.parsing.files import open_regular
 from bevcli.printing import aligned, number, one_line
 from bevcli.writing import whole_file
 
@@ -60,7 +63,7 @@ class Table:
                 if index not in self.left and cell != "":
                     ends = zip((" low", " high"), cell, strict=True) if isinstance(cell, tuple) else [("", cell)]
                     for end, value in ends:
-                        yield self.name, name, column + end, value if value == value else ""  # not NaN
+                        yield self.name, cell_of(name), column + end, value if value == value else ""  # not NaN
         for column, total in self.sums.items():
             yield self.name, "all", column, total if total == total else ""
 
@@ -90,5 +93,9 @@ def write_latex(tables: Iterable[Table], path: Path) -> None:
 
 
 def _write(path: Path, text: str) -> None:
+    """Write a file, also over an earlier one of its kind, and over no other: it may be an input."""
+    start = text.partition("\n")[0].encode()
+    if path.is_file() and open_regular(path, error=OutputError).read(len(start)) != start:
+        raise OutputError(f"{path}: is there, and is no table of scores: name another file")
     with whole_file(path, parents=True) as unfinished:
         unfinished.write_text(text, encoding="utf-8", newline="\n")
