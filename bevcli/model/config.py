@@ -220,7 +220,7 @@ class ModelConfig:
         object_classes(self.classes, self.class_settings)
         if self.hybrid_queries.count and self.detector is None:
             raise ValueError('hybrid_queries needs image_detector, or a backbone that is a detector, such as "nanodet"')
-        if self.hybrid_queries.count and self.hybrid_queries.features not in self.detector.output_channels():
+        if self.hybrid_queries.count and self.hybrid_queries.features != CHANNELS:
             raise ValueError(f"hybrid_queries.features must be the channels of the detector's maps, {CHANNELS}")
         smaller, whole = self.backbone_scale
         if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
