@@ -1,14 +1,19 @@
-"""Texts for a terminal. They may hold names and contents of files, so control characters are printed as escapes."""
+"""Texts for a terminal, and cells of tables.
+
+They may hold names and contents of files, so control characters are printed as escapes.
+"""
 
 import difflib
 import io
 import math
+import re
 import sys
 import unicodedata
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 LONGEST_MESSAGE, LONGEST_LIST, LONGEST_NAME = 1000, 300, 60  # characters
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
 
 def one_line(value: object, longest: int = LONGEST_MESSAGE) -> str:
@@ -112,6 +117,16 @@ def duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def cell_of(name: str) -> str:
+    """The cell of a name from outside, with an apostrophe in front of what would be a formula."""
+    return f"'{name}" if _FORMULA.match(name) else name
+
+
+def name_of(cell: str) -> str:
+    """The name in a cell of `cell_of`."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def quoted(value: object) -> object:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.printing import reason_of, shortened
+from bevcli.printing import name_of, reason_of, shortened
 
 DEEPEST = 64  # levels of nested lists and objects
 LARGEST_INTEGER = 2**62  # the difference of two such integers still fits 64 bits
@@ -37,7 +37,6 @@ CSV_BYTES = 256 << 20
 NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
 UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
-_FORMULA = re.compile(r"'*[=+\-@\t\r]")  # a spreadsheet would compute a cell such as `=1+1` or `-1`
 
 
 def read_json(
@@ -164,16 +163,6 @@ def without_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-def cell_of(name: str) -> str:
-    """The cell of a name from outside, with an apostrophe in front of what would be a formula."""
-    return f"'{name}" if _FORMULA.match(name) else name
-
-
-def name_of(cell: str) -> str:
-    """The name in a cell of `cell_of`."""
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 @dataclass(frozen=True)

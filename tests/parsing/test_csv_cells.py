@@ -9,7 +9,7 @@ from recorded_drive import boxes_ahead
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.documents import cell_of, name_of
+from bevcli.printing import cell_of, name_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.open import open_sequence

@@ -13,13 +13,16 @@ from small_fleet import write_fleet
 
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError
+from bevcli.inference.load import Model
+from bevcli.inference.runner import StepOptions
+from bevcli.model.temporal_model import build_model
 from bevcli.sequences.native.folder import FolderDrive
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
 from bevcli.workshop.training.samples import ClipConfig
-from bevcli.workshop.training.validation import check_scored_drives, check_training_drives
+from bevcli.workshop.training.validation import check_scored_drives, check_training_drives, run_drives
 
 CPU = torch.device("cpu")
 SETTINGS = {"clips.frames": "2", "clips.batch": "1", "held_out": "1", "steps": "1"}
@@ -235,3 +238,16 @@ def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_pat
         fleet / "mini.toml"
     ).stat().st_mode & 0o777
     assert list((tmp_path / "out" / "tensorboard").glob("events.out.tfevents.*"))
+
+
+def test_missing_images_of_a_scored_drive_are_told(
+    fleet: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shutil.copytree(fleet / "d000", tmp_path / "d000")
+    images = sorted(path for path in (tmp_path / "d000/images").rglob("*") if path.is_file())
+    for path in images[1:]:
+        path.unlink()
+    model = Model(build_model(load_config(fleet / "mini.toml")).eval())
+    frames = run_drives(model.runner(StepOptions()), FolderDrives((tmp_path / "d000",), model.config))
+    assert sum(bool(frame.images) for _, frame, _ in frames) == 1
+    assert f"d000: {len(images) - 1} images cannot be read" in caplog.text

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import NUMBERS, OPTIONAL_COLUMNS, TABLE_COLUMNS, Boxes2D
-from bevcli.parsing.documents import cell_of
+from bevcli.printing import cell_of
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, boxes_to_json
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.writing import whole_file

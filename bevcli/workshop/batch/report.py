@@ -24,8 +24,7 @@ from bevcli.geometry.matching import ERRORS, DetectionConfig, ScoredBoxes
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
-from bevcli.parsing.documents import cell_of
-from bevcli.printing import counted, duration
+from bevcli.printing import cell_of, counted, duration
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.job import Record
 from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage

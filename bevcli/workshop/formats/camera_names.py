@@ -11,9 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from bevcli.errors import InputError
-from bevcli.parsing.documents import CSV_BYTES, name_of
+from bevcli.parsing.documents import CSV_BYTES
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text
 from bevcli.parsing.images import size_of_image
+from bevcli.printing import name_of
 from bevcli.sequences.videos import size_of_video
 
 SHORT = {

@@ -20,9 +20,9 @@ from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, velocities_between
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.documents import CsvRow, name_of
+from bevcli.parsing.documents import CsvRow
 from bevcli.parsing.files import MIB, read_bytes
-from bevcli.printing import counted
+from bevcli.printing import counted, name_of
 from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames

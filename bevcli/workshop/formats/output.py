@@ -17,8 +17,8 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
-from bevcli.parsing.documents import cell_of
 from bevcli.parsing.images import encode_image
+from bevcli.printing import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY

@@ -8,9 +8,8 @@ from itertools import chain
 from pathlib import Path
 
 from bevcli.errors import OutputError
-from bevcli.parsing.documents import cell_of
 from bevcli.parsing.files import open_regular
-from bevcli.printing import aligned, number, one_line
+from bevcli.printing import aligned, cell_of, number, one_line
 from bevcli.writing import whole_file
 
 Cell = str | int | float | tuple[float, float]  # a pair: the ends of an interval

@@ -7,6 +7,7 @@ import contextlib
 import csv
 import importlib.util
 import io
+import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,6 +27,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import MIB, read_text
+from bevcli.printing import counted, one_line
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import count_labels, scenes_of
@@ -194,11 +196,15 @@ ScoredFrame = tuple[int, Frame, Prediction]  # index of the drive, the frame, an
 
 
 def run_drives(runner: Runner, drives: Drives) -> Iterator[ScoredFrame]:
-    """Run every frame of the drives."""
+    """Run every frame of the drives. A drive that lacks images gets a warning: what they show is missed."""
     for index in range(len(drives)):
-        drive = drives.open(index)
+        drive, missing = drives.open(index), 0
         for frame, prediction, _ in runner.run(drive):
+            missing += len(frame.dropped)
             yield index, frame, prediction
+        if missing:
+            words = f"{drive.name}: {counted(missing, 'images')} cannot be read: what they show counts as missed"
+            logging.getLogger("bevcli").warning("warning: %s", one_line(words))
 
 
 def validate(

@@ -16,7 +16,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.runner import RunnerState
-from bevcli.parsing.documents import cell_of
+from bevcli.printing import cell_of
 from bevcli.sequences.files.boxes_file import BoxesFile
 from bevcli.workshop.scores.inputs import boxes_of_drive, open_predictions
 from bevcli.workshop.trust.agreement import Agreement, FrameAgreement, agreement, compared

@@ -13,7 +13,8 @@ import numpy as np
 from bevcli.frame import FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.documents import CsvRow, cell_of, read_csv
+from bevcli.parsing.documents import CsvRow, read_csv
+from bevcli.printing import cell_of
 from bevcli.recording.entities import EGO_COLOR
 from bevcli.sequences.files.incremental_json import GrowingFile
 
