@@ -101,7 +101,7 @@ def _drives_of(source: str, options: NuScenesOptions, name: str = "") -> Iterato
             for name, path_inside in inside.items():
                 yield from _drives_of(str(path_inside), options, name.replace("/", "-"))
         else:
-            yield replace(drive, input_hash=_hash(drive.name, None, storage.files()))
+            yield replace(drive, input_hash=hash_of_values([drive.name, None, storage.files()]))
     except BevcliError as error:
         yield replace(drive, problem=str(error))
 
@@ -116,11 +116,7 @@ def _scenes(root: BatchDrive, options: NuScenesOptions) -> Iterator[BatchDrive]:
     index, _ = open_index(tables)
     for number in chosen_scenes(index, tables, options.split):
         scene = str(index.scenes.names[number])
-        yield BatchDrive(root.source, _safe_name(scene), scene, _hash(tables.name, scene, files))
-
-
-def _hash(name: str, scene: str | None, files: list[StoredFile]) -> str:
-    return hash_of_values([name, scene, files])
+        yield BatchDrive(root.source, _safe_name(scene), scene, hash_of_values([tables.name, scene, files]))
 
 
 def _safe_name(source: str) -> str:

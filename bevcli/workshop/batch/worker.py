@@ -31,7 +31,7 @@ from bevcli.parsing.files import is_there
 from bevcli.printing import reason_of, valid_text
 from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.runs.state import save_state
-from bevcli.runs.summary import SUMMARY, RunSummary
+from bevcli.runs.summary import SUMMARY
 from bevcli.sequences.format import format_of
 from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage
@@ -112,11 +112,13 @@ class Worker:
                 raise BevcliError(_with_final_paths(str(error), (path, drive.source), (aside, result))) from None
             seconds = time.perf_counter() - fetched
             scores, why_not = self._score(drive, path, aside)
+            content: dict[str, Any] = summary.to_dict()
             record = {
                 **_about(drive, result),
                 "attempts": attempt,
                 "error": "",
-                **_summary_columns(summary),
+                **{name: content[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")},
+                **{name: len(content[name]) for name in ("dropped_images", "skipped_frames", "not_finite_frames")},
                 "seconds": round(seconds, 3),
                 "frames_per_second": round(summary.frames / seconds, 4),
                 "fetch_seconds": round(fetched - began, 3),
@@ -189,13 +191,6 @@ def use_threads(count: int) -> None:
 
 def _about(drive: BatchDrive, result: str) -> Record:
     return {"drive": drive.name, "source": valid_text(drive.source), "scene": drive.scene, "result": result}
-
-
-def _summary_columns(summary: RunSummary) -> Record:
-    content = summary.to_dict()
-    counts = {name: content[name] for name in ("frames", "boxes", "boxes_by_class", "tracks")}
-    lists = ("dropped_images", "skipped_frames", "not_finite_frames")
-    return counts | {name: len(content[name]) for name in lists}  # type: ignore[arg-type]
 
 
 def _score_columns(scores: Scores) -> Record:

@@ -243,6 +243,7 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
     if read_metadata(metadata, file).precision != "fp32":
         raise WeightsError(f"{file}: is quantised already (expected a file of bevcli export-onnx)")
     check_output(out, file)
+    clips = any(node.op_type == "Clip" and node.name.startswith(QUANTIZED_PARTS) for node in proto.graph.node)
     # Without advice about models that have not been simplified.
     with errors_only(""), whole_file(out, parents=True) as unfinished:
         quantization.quantize_static(
@@ -258,7 +259,9 @@ def quantize(file: Path, images: Iterable[np.ndarray], out: Path) -> None:
             extra_options={
                 "WeightSymmetric": True,
                 "ActivationSymmetric": False,
-                "OpTypesToExcludeOutputQuantization": _unrounded(proto.graph),
+                # Before a ReLU6 a convolution has results far outside of 0 to 6, and few steps of 8 bits would be left
+                # for these: its results are rounded only where another operator in INT8 reads them.
+                "OpTypesToExcludeOutputQuantization": ["Conv"] if clips else [],
             },
         )
         quantized = onnx.load(str(unfinished))
@@ -279,15 +282,6 @@ def quantized_nodes(graph: Any) -> list[str]:
         if computes and parts[0] in QUANTIZED_PARTS and not DEFORMABLE.intersection(parts):
             names.append(node.name)
     return names
-
-
-def _unrounded(graph: Any) -> list[str]:
-    """Operators whose results are rounded only where another one in INT8 reads them.
-
-    Before a ReLU6 a convolution has results far outside of 0 to 6, and few steps of 8 bits would be left for these.
-    """
-    clips = [node for node in graph.node if node.op_type == "Clip" and node.name.startswith(QUANTIZED_PARTS)]
-    return ["Conv"] if clips else []
 
 
 class CalibrationFeeds:

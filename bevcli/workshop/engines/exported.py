@@ -19,7 +19,6 @@ from bevcli.inference.load import Model, load_model
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.segmentation import SegmentationOutputs
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import Memory, TemporalModel, model_class
 from bevcli.options import refuse, spread
@@ -203,7 +202,9 @@ def compare_outputs(frame: int, ours: ModelOutputs, theirs: ModelOutputs) -> Fra
     distances = codes[..., CENTER].norm(dim=-1)
     others = [index for index in range(codes.shape[-1]) if index not in CENTER]
     probabilities = [
-        _probabilities(outputs.segmentation) for outputs in (ours, theirs) if outputs.segmentation is not None
+        maps.mask_logits[-1].sigmoid() * maps.class_logits[-1].sigmoid()[..., None]
+        for maps in (ours.segmentation, theirs.segmentation)
+        if maps is not None
     ]
     further = {name: tensor for name, tensor in ours.by_name.items() if name not in COMPARED}
     return FrameDifference(
@@ -229,10 +230,6 @@ def difference_lines(differences: list[FrameDifference]) -> list[str]:
     rows = [heads, *((*first, *row) for first, row in zip(firsts, written, strict=True))]
     widths = [max(9, len(head)) for head in heads]
     return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
-
-
-def _probabilities(segmentation: SegmentationOutputs) -> Tensor:
-    return segmentation.mask_logits[-1].sigmoid() * segmentation.class_logits[-1].sigmoid()[..., None]
 
 
 def _largest(ours: Tensor, theirs: Tensor) -> float:

@@ -259,7 +259,8 @@ class MotionMeter:
         carried = motion_of(state)[:3, :3].T @ (self._road + up)
         way_m = min(float(np.hypot(*state[3:5])), 1.0)
         carried /= 1 + np.linalg.norm(carried) * way_m * (CHANGE_RAD / SLOPE_RAD) ** 2
-        return np.asarray(carried + up + told * _normal(state))
+        normal = np.array([*-next_slopes(state), 1.0])  # up from the road
+        return np.asarray(carried + up + told * (normal / np.linalg.norm(normal)))
 
     def _expected(self, seconds: float) -> Array | None:
         """(8,) the state of a step at constant velocity."""
@@ -276,12 +277,6 @@ class MotionMeter:
         deviations = wide * np.array([*[ROCKING] * 2, TURNING, SPEEDING, SPEEDING / 4, SPEEDING / 8])
         state = np.zeros(COUNT - 1) if state is None else state
         return MeasuredStep(motion_of(state), np.diag(deviations**2), reason, road=self._road_after(state, seconds))
-
-
-def _normal(state: Array) -> Array:
-    """(3,) the direction up from the road, in the second ego frame of a step with a state (8,)."""
-    normal = np.array([*-next_slopes(state), 1.0])
-    return normal / np.linalg.norm(normal)
 
 
 def measure_steps(drive: Drive, options: OdometryOptions | None = None) -> Iterator[MeasuredStep]:

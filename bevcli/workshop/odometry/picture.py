@@ -174,7 +174,11 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Arra
     cells = [grid[0], grid[1], grid[2]] if wide else [grid[:, 0], grid[0, 1], grid[1, 1]]
     way, speed, yaw_rate = (figure.add_subplot(cell) for cell in cells)
     _draw_way(way, motion, road, stated_poses)
-    others = None if stated_poses is None else _motion_of(motion, stated_poses)
+    others = None
+    if stated_poses is not None:  # as a motion
+        moves = [inverse(a) @ b for a, b in pairwise(stated_poses)]
+        steps = [replace(step, ego_a_from_ego_b=move) for step, move in zip(motion.steps, moves, strict=True)]
+        others = replace(motion, steps=tuple(steps))
     _draw_curve(speed, motion, speeds(motion), None if others is None else speeds(others)[0], "speed, m/s")
     of_stated = None if others is None else yaw_rates_deg(others)[0]
     _draw_curve(yaw_rate, motion, yaw_rates_deg(motion), of_stated, "yaw rate, °/s")
@@ -182,15 +186,6 @@ def draw(motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Arra
     kmh = speed.secondary_yaxis("right", functions=(partial(np.multiply, KMH), partial(np.multiply, 1 / KMH)))
     kmh.set_ylabel("km/h")
     return figure
-
-
-def _motion_of(motion: MeasuredMotion, stated_poses: Sequence[Array]) -> MeasuredMotion:
-    """Stated poses as a motion, for the curves."""
-    steps = [
-        replace(step, ego_a_from_ego_b=inverse(a) @ b)
-        for step, (a, b) in zip(motion.steps, pairwise(stated_poses), strict=True)
-    ]
-    return replace(motion, steps=tuple(steps))
 
 
 def _draw_way(axes: Axes, motion: MeasuredMotion, road: StitchedRoad, stated_poses: Sequence[Array] | None) -> None:

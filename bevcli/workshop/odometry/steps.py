@@ -235,11 +235,6 @@ class Candidate:
         return np.array([np.copysign(np.hypot(*self.state[3:5]), self.state[3]), self.state[2]]) / seconds
 
 
-def along_arc(distance: float, yaw: float, slopes: Array) -> Array:
-    """(8,) the start of a vehicle that drives along an arc."""
-    return np.array([0, 0, yaw, distance * np.cos(yaw / 2), distance * np.sin(yaw / 2), 0, *slopes])
-
-
 @dataclass(frozen=True)
 class Guess:
     """What is expected of a step from the one before."""
@@ -266,7 +261,10 @@ def direction(step: StepViews, points: EpipolarResiduals, guess: Guess) -> Array
     expected, length = guess.state, USUAL_M
     if expected is not None and np.hypot(*expected[3:5]) > SHORTEST_M:
         length = float(expected[3])
-    starts = [along_arc(length, yaw, guess.slopes) for yaw in YAWS] + ([] if expected is None else [expected])
+    arcs = (
+        (yaw, length * np.cos(yaw / 2), length * np.sin(yaw / 2)) for yaw in YAWS
+    )  # of a vehicle along each of them
+    starts = [np.array([0, 0, *arc, 0, *guess.slopes]) for arc in arcs] + ([] if expected is None else [expected])
     costs = []
     for start in starts:
         unknowns = step.unknowns(start, guess.deviations(start, known_distance=True))

@@ -248,8 +248,9 @@ class StressTest:
                         for _ in self._run_scene(runner, condition, index):
                             done += 1
                             yield done
-                    scores = (*self.results.scores, self._scores(condition))
-                    self.results = replace(self.results, scores=tuple(sorted(scores, key=_order)))
+                    scores = {(s.corruption, s.severity): s for s in (*self.results.scores, self._scores(condition))}
+                    order = [(known.name, known.severity) for known in choose_conditions()]  # clean first
+                    self.results = replace(self.results, scores=tuple(scores[key] for key in order if key in scores))
                     save_state(folder.state_path, StressState(self._fingerprint, self.results.scores))
                     self._write_results()
                     for index in range(len(self._scenes)):
@@ -322,12 +323,6 @@ def split_scenes(drive: Drive) -> list[Drive]:
     if not drive.stamps:
         raise InputError(f"{drive.name}: has no frames")
     return [select(drive, indices) for indices in scenes_of(drive.stamps)]
-
-
-def _order(scores: ConditionScores) -> int:
-    """Clean first, then as in CORRUPTIONS."""
-    conditions = [(condition.name, condition.severity) for condition in choose_conditions()]
-    return conditions.index((scores.corruption, scores.severity))
 
 
 def _fingerprint_of(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:

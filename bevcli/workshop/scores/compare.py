@@ -238,6 +238,9 @@ def compare(
     count = scores[0].detection.frame_count
     if count < FEW_FRAMES:
         notes.append(f"the intervals are too narrow for {counted(count, 'frames')} (expected {FEW_FRAMES} or more)")
+    of_a, of_b = (side.notes for side in scores)
+    notes += [note for note in of_a if note in of_b]
+    notes += [f"A: {note}" for note in of_a if note not in of_b] + [f"B: {note}" for note in of_b if note not in of_a]
     differences = _differences(scores, resamples)
     return Comparison(
         (Path(a), Path(b)),
@@ -247,7 +250,7 @@ def compare(
         differences["NDS"],
         find_worst_frames(models, options.worst or WORST),
         resamples,
-        (*notes, *_joined_notes(scores)),
+        tuple(notes),
     )
 
 
@@ -297,14 +300,6 @@ def _at(model: Compared, indices: list[int]) -> Compared:
     assert model.truth is not None
     predictions, truth = replace(model.predictions, maps=None), replace(model.truth, maps=None)
     return replace(model, pairs=kept, predictions=predictions, truth=truth)
-
-
-def _joined_notes(scores: Sequence[Scores]) -> list[str]:
-    """The notes of both, and with the name of the model those of one."""
-    of_a, of_b = (score.notes for score in scores)
-    only_a = [f"A: {note}" for note in of_a if note not in of_b]
-    only_b = [f"B: {note}" for note in of_b if note not in of_a]
-    return [*(note for note in of_a if note in of_b), *only_a, *only_b]
 
 
 def _differences(scores: Sequence[Scores], resamples: int) -> dict[str, Difference]:

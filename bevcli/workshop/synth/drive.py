@@ -243,7 +243,9 @@ class RenderedDrive:
         actors = [self._placed(state.body, state.pose, *state.position.tolist(), state.yaw) for state in near]
         signals = list(self._scenery.signals_around(here, self.simulation.signals, time_s))
         moving = TriangleSoup.gather([*actors, *signals], [*near_first.tolist(), *[-1] * len(signals)])
-        shadows = shadows.with_shadows_of([moving.corners, self._ego_corners(world_from_ego)])
+        x, y, _ = apply(world_from_ego.matrix, MIDDLE)
+        vehicle = self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw)
+        shadows = shadows.with_shadows_of([moving.corners, vehicle.corners])
         soup = TriangleSoup.gather([scenery, moving])
         snapshot = WorldSnapshot(soup, len(actors), ground, shadows, self.weather)
         if self._looks is not None:
@@ -290,11 +292,6 @@ class RenderedDrive:
             mesh = self._looks.body(mesh, body.instance, recolour=not body.variant.shaded)
             paint = self._looks.paint(paint, body.instance)
         return TriangleSoup.from_mesh(mesh.fitted(body.size_lwh)).painted(paint, body.dye, body.variant.shaded)
-
-    def _ego_corners(self, world_from_ego: Pose) -> NDArray[np.float32]:
-        """(T, 3, 3) triangles of the ego vehicle, for its shadow."""
-        x, y, _ = apply(world_from_ego.matrix, MIDDLE)
-        return self._placed(self.simulation.ego_body, 0, x, y, 0.0, world_from_ego.yaw).corners
 
     def _boxes(self, states: list[ActorState], views: Mapping[str, RenderedView], pose: Pose) -> Boxes3D:
         """Ground truth boxes in the world frame, within ANNOTATED_M of the origin of the bev frame."""

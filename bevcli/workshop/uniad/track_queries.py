@@ -178,24 +178,17 @@ class MemoryBank(nn.Module):
         """embedding: (K, C) of the decoder -> the embedding (K, C) after the attention, and the memories after it."""
         remembers = ~memories.is_empty[:, -1]
         if remembers.any():
-            attended = self._attend(embedding[remembers], memories[remembers])
-            embedding = embedding.masked_scatter(remembers[:, None], attended)
-        return embedding, self._saved(embedding, memories)
-
-    def _attend(self, embedding: Tensor, memories: Memories) -> Tensor:
-        slots = memories.embeddings
-        attended, _ = self.attention(
-            embedding[:, None], slots, slots, key_padding_mask=memories.is_empty, need_weights=False
-        )
-        embedding = self.norms[0](embedding + attended[:, 0])
-        return self.norms[1](embedding + self.reduce(F.relu(self.expand(embedding))))
-
-    def _saved(self, embedding: Tensor, memories: Memories) -> Memories:
+            query, known = embedding[remembers], memories[remembers]
+            slots, is_empty = known.embeddings, known.is_empty
+            attended, _ = self.attention(query[:, None], slots, slots, key_padding_mask=is_empty, need_weights=False)
+            query = self.norms[0](query + attended[:, 0])
+            query = self.norms[1](query + self.reduce(F.relu(self.expand(query))))
+            embedding = embedding.masked_scatter(remembers[:, None], query)
         saves = memories.wait == 0
         newest = self.save_projection(embedding)[:, None]
         shifted = torch.cat([memories.embeddings[:, 1:], newest], dim=1)
         shifted_empty = torch.cat([memories.is_empty[:, 1:], torch.zeros_like(memories.is_empty[:, :1])], dim=1)
-        return Memories(
+        return embedding, Memories(
             torch.where(saves[:, None, None], shifted, memories.embeddings),
             torch.where(saves[:, None], shifted_empty, memories.is_empty),
             torch.where(saves, self.interval - 1, memories.wait - 1),
