@@ -123,7 +123,8 @@ def facts_of(name: str) -> dict[str, str]:
     return facts
 
 
-@pytest.mark.parametrize("model", [pytest.param(name, marks=[pytest.mark.slow] * (name != "tiny")) for name in MODELS])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
 def test_the_tables_state_the_shapes_and_sizes_of_the_models(model):
     assert {label: stated[model] for label, stated in table_rows(MODELS).items()} == facts_of(model)
 

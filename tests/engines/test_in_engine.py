@@ -67,6 +67,7 @@ def boxes(model, drive):
     return [prediction.boxes for _, prediction in run(model, drive, track=False)]
 
 
+@pytest.mark.slow
 def test_the_boxes_in_an_engine_are_those_of_torch(steps, drive, network):
     expected = boxes(Model(network), drive)
     for engine in installed_engines():

@@ -87,6 +87,7 @@ def test_equal_models_have_no_difference(files: tuple[Path, Path, Path]) -> None
     assert same.worst.lists["difference"] == []
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_two_separate_evals(files: tuple[Path, Path, Path]) -> None:
     both, alone = evaluated(*files), [evaluated(file, files[2]) for file in files[:2]]
     assert both["scores"] == alone

@@ -266,6 +266,7 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are counted on Linux")
 def test_the_threads_of_earlier_recordings_end(tmp_path):
     def streams() -> int:

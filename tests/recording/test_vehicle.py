@@ -169,6 +169,7 @@ def test_a_mesh_is_read_with_our_packages_not_the_folders(tmp_path, monkeypatch)
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.slow
 def test_an_error_in_the_process_of_a_mesh_is_one_line(tmp_path):
     (tmp_path / "empty.ply").touch()
     with pytest.raises(InputError, match=r"^\S*/empty.ply: trimesh cannot read this mesh file \(.*$"):

@@ -173,7 +173,14 @@ def kitti_raw(root: Path) -> Path:
     return drive
 
 
-@pytest.mark.parametrize("layout", ["raw", "poses/07.txt", "sequences/07/poses.txt", "sequences/07/07.txt"])
+LAYOUTS = [
+    "raw",
+    "poses/07.txt",
+    *(pytest.param(f"sequences/07/{name}.txt", marks=pytest.mark.slow) for name in ("poses", "07")),
+]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_kitti_as_it_lies_on_disk(tmp_path, layout):
     drive = kitti_raw(tmp_path) if layout == "raw" else kitti_odometry(tmp_path, layout)
     sequence = open_sequence(drive)

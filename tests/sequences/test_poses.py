@@ -255,6 +255,7 @@ def test_a_mistake_is_one_line_that_names_the_place(text, said, tmp_path):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_poses_of_a_long_drive_take_little_memory(tmp_path):
     """The file has 6 MB, and the poses 19."""
     count = 140_000

@@ -144,6 +144,7 @@ def test_a_levelled_bev_frame_projects_points_where_images_show_them(moving, pit
     np.testing.assert_allclose(upward[1], mean / np.linalg.norm(mean), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_drive_that_is_read_has_the_road_of_its_poses(assets, tmp_path):
     rig = DrawnRig(nuscenes_like_rig(160, 90), body="moving")
     drive = RenderedDrive(5, frames=2, rig=rig, assets=assets)

@@ -64,6 +64,7 @@ def test_a_teacher_gives_the_maps_of_its_weights(model: BEVFormer, weights: Path
         torch.testing.assert_close(one, two, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_model_learns_from_a_teacher(weights: Path, tmp_path: Path) -> None:
     losses = learned(DistillationLossConfig(weight=100.0, teacher=str(weights)), NOISE, tmp_path, "distillation")
     assert losses[-1] < 0.8 * losses[0]

@@ -100,7 +100,8 @@ def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, e
     assert (np.abs(car - [44, 158, 255]).sum(-1) < 120).any()  # the car's orange, BGR
 
 
-@pytest.mark.parametrize("ending", ["webm", pytest.param("mp4", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", ["webm", "mp4"])
 def test_a_video_that_does_not_fit_is_an_error(drive, tmp_path, ending):
     """A limit on the size of files is what a full disk is to OpenCV, which tells neither."""
     path, before = tmp_path / f"video.{ending}", resource.getrlimit(resource.RLIMIT_FSIZE)
