@@ -87,6 +87,7 @@ def test_the_kernels_are_those_that_a_model_gets(monkeypatch):
     assert torch_checks.kernels()["bf16"] == "for images only (no AMX)"
 
 
+@pytest.mark.slow
 def test_speed_measures_each_model_until_the_time_is_over(tmp_path, monkeypatch):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):

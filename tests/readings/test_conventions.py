@@ -24,7 +24,12 @@ def street():
     return open_sequence(STREET, every=2, frames=slice(0, 3), ground_truth=False)
 
 
-@pytest.mark.parametrize("name", CONVENTIONS)
+FAST = ("lidar of nuScenes", "KITTI's rows of a vehicle")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in FAST)) for name in CONVENTIONS]
+)
 def test_the_images_tell_what_files_mean(name, street, tmp_path):
     options = write(street, tmp_path, CONVENTIONS[name])
     found = opened(tmp_path, options)
@@ -57,6 +62,7 @@ def test_of_a_vehicle_that_stands_both_sides_tell(street, tmp_path):
     assert found.rig["cam0"].yaw == pytest.approx(street.rig.cameras[0].yaw, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_what_is_stated_is_believed_and_a_note_says_what_fits(street, tmp_path):
     options = write(street, tmp_path, Convention(rig_axes="rfu", transform="T"))
     stated = {"pose_axes": "flu", "pose_transform": "body_from_world"}
