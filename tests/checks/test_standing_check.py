@@ -103,7 +103,7 @@ def test_it_takes_less_than_50_ms_in_a_run(standing):
     assert time.process_time() - start < 0.1  # 27 frames, on a machine that may be busy
 
 
-@pytest.mark.parametrize("static", [("--static",), ("--static", "--no-temporal")])
+@pytest.mark.parametrize("static", [("--static",), pytest.param(("--static", "--no-temporal"), marks=pytest.mark.slow)])
 def test_a_run_advises_no_history(static, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     run = ("run", str(SAMPLE), "--model", "mini.toml", "--untrained", "--frames", "4:10", "--no-track")

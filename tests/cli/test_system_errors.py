@@ -16,7 +16,7 @@ from bevcli.errors import OutputError
 PROGRAM = [sys.executable, "-m", "bevcli"]
 
 
-@pytest.mark.parametrize("streams", [">&-", "<&-", ">&- 2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
 def test_closed_streams_are_null_devices(streams):
     """Else the next file that the program opens becomes its stdout."""
     done = subprocess.run(["sh", "-c", f'"$@" --version {streams}', "sh", *PROGRAM], capture_output=True, check=False)

@@ -293,10 +293,10 @@ def cut(index):
     ("asked", "count"),
     [
         ({}, OVERLAPPED),
-        ({"change": spoilt(2)}, OVERLAPPED),
+        pytest.param({"change": spoilt(2)}, OVERLAPPED, marks=pytest.mark.slow),
         ({"change": spoilt(OVERLAPPED - 1)}, OVERLAPPED),
         ({"change": cut(3)}, 3),
-        ({"broken": 3}, 3),
+        pytest.param({"broken": 3}, 3, marks=pytest.mark.slow),
         ({"broken": 0}, 0),
     ],
     ids=["whole", "not finite", "not finite at the end", "error in a step", "error in reading", "error at once"],

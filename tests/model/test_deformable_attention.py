@@ -144,7 +144,7 @@ def test_compiled_loops_have_the_gradients_of_the_plain_module(depth, threads, m
         torch.testing.assert_close(found[inside], expected[inside], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("dtype", [torch.bfloat16, pytest.param(torch.float16, marks=pytest.mark.slow)])
 def test_half_precision_values_are_summed_in_float32(dtype):
     inputs = case(16, dtype=dtype)
     found = COMPILED(*inputs)

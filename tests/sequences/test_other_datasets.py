@@ -448,6 +448,7 @@ def argoverse2_log(shared, tmp_path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_objects_of_argoverse2_stand_on_the_ground(argoverse2_log):
     """Argoverse's origin is the rear axle: without the option, objects around the vehicle stand 0.34 m below z = 0."""
     drive = open_sequence(argoverse2_log)

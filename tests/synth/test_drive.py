@@ -16,6 +16,7 @@ from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.synth.traffic import ActorState
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(drive: RenderedDrive, frame: RenderedFrame, assets: Assets):
     """Independent of the frames rendered before, and of the number of threads."""
     two = CameraRig(drive.rig.cameras[:2], drive.rig.ego_from_bev)

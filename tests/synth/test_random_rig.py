@@ -90,6 +90,7 @@ def delayed(tmp_path_factory: pytest.TempPathFactory, assets: Assets) -> tuple[R
     return drive, open_sequence(folder).load(1), drive.frame(1)
 
 
+@pytest.mark.slow
 def test_a_late_camera_has_its_own_time_and_pose(delayed: tuple[RenderedDrive, Frame, RenderedFrame]):
     drive, frame, _ = delayed
     assert frame.images["CAM_FRONT_LEFT"].timestamp_ns - frame.stamp.timestamp_ns == 50_000_000

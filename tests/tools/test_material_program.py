@@ -89,6 +89,7 @@ def box(*size: float) -> Soup:
     return Soup(mesh.triangles[:, ::-1].copy(), np.zeros((12, 3, 2)), top.astype(int), parts)
 
 
+@pytest.mark.slow
 def test_a_vehicle_has_its_size_paint_and_glass() -> None:
     inside = box(0.4, 0.4, 0.4)
     inside = inside._replace(corners=inside.corners + (0.03, 0.05, 0.02))

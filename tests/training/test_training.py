@@ -81,6 +81,7 @@ def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     return one
 
 
+@pytest.mark.slow
 def test_a_stopped_and_killed_training_resumes_as_if_uninterrupted(whole: Trainer, tmp_path: Path) -> None:
     stopped = trainer(tmp_path / "part")
     run_and_kill(stopped, after=1)
@@ -202,6 +203,7 @@ def test_a_training_leaves_only_weights_that_can_be_loaded(tmp_path: Path) -> No
     torch.testing.assert_close(model.backbone.conv1.weight, expected, atol=1e-3, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_training_draws_its_learning_curves(whole: Trainer) -> None:
     assert cv2.imread(str(whole.job.out / "curves.png")).std() > 10
 
