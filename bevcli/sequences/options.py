@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from bevcli.errors import InputError
 from bevcli.options import option, options, parse_pairs
@@ -150,6 +150,11 @@ def _number(text: str) -> float:
     return value
 
 
+PoseAngles: TypeAlias = Literal[
+    "degrees", "radians", "compass", "compass-radians", "clockwise", "clockwise-radians", "wxyz", "xyzw"
+]
+
+
 @options("Input")
 class RigOptions:
     """What replaces the calibration and the ego-motion of an input. A format that takes it inherits it."""
@@ -170,22 +175,23 @@ class RigOptions:
     transform: Literal["ego_from_camera", "camera_from_ego"] | None = option(
         default=None, help="What the transforms of --calibration are. Default: what the images show."
     )
-    rig_axes: Literal["flu", "frd", "rfu", "rdf"] | None = option(
+    rig_axes: str | None = option(
         default=None,
-        help="Axes x, y, z of the vehicle in --calibration: f forward, l left, r right, u up, d down. Default: what "
-        "the images show.",
+        help="Axes x, y, z of the vehicle in --calibration, such as flu: f forward, b backward, l left, r right, u up, "
+        "d down. Default: what the images show.",
+        metavar="XYZ",
     )
-    camera_axes: Literal["optical", "vehicle", "opengl"] | None = option(
+    camera_axes: Literal["optical", "vehicle", "opengl", "unity", "unreal"] | None = option(
         default=None,
         help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
-        "up (opengl).",
+        "up, z backward (opengl); the same, z forward (unity); x forward, y right, z up (unreal).",
     )
     rig_angles: Literal["wxyz", "xyzw", "vector", "radians", "degrees"] | None = option(
         default=None,
         help="What the numbers of a rotation in --calibration are: a quaternion, a rotation vector, or roll, pitch and "
         "yaw.",
     )
-    rig_unit: Literal["m", "cm", "mm"] | None = option(
+    rig_unit: Literal["m", "cm", "mm", "in", "ft"] | None = option(
         default=None, help="Unit of the translations in --calibration. Default: the one that gives a vehicle."
     )
     fov_deg: float | Mapping[str, float] | None = option(
@@ -223,18 +229,23 @@ class RigOptions:
     pose_times: TimeUnit | None = option(
         default=None, help="Unit of the times in --ego-motion. Default: the only possible one."
     )
-    pose_angles: Literal["degrees", "radians", "compass", "compass-radians", "wxyz", "xyzw"] | None = option(
+    pose_angles: PoseAngles | None = option(
         default=None,
-        help="Unit of the angles in --ego-motion (compass: degrees clockwise from north), or the order of its "
-        "quaternions. Default: what the images show.",
+        help="Unit of the angles in --ego-motion (compass: degrees clockwise from north; clockwise: degrees clockwise "
+        "from x), or the order of its quaternions. Default: what the images show.",
+    )
+    pose_unit: Literal["m", "cm", "mm", "ft"] | None = option(
+        default=None, help="Unit of the positions in --ego-motion. Default: metres, if a vehicle can be as fast."
     )
     poses_of: str | None = option(
         default=None,
         help='Camera whose poses --ego-motion has, or "vehicle". Default: what the images show.',
         metavar="CAMERA|vehicle",
     )
-    pose_axes: Literal["flu", "frd", "rfu"] | None = option(
-        default=None, help="Axes of the vehicle in --ego-motion, as --rig-axes. Default: what the images show."
+    pose_axes: str | None = option(
+        default=None,
+        help="Axes of the vehicle, or of the camera, in --ego-motion, as --rig-axes. Default: what the images show.",
+        metavar="XYZ",
     )
     pose_transform: Literal["world_from_body", "body_from_world"] | None = option(
         default=None, help="What the poses of --ego-motion are. Default: what the images show."

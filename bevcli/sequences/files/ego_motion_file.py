@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from bevcli.parsing.files import is_there, open_regular
 from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.options import RigOptions
 
+EGO_MOTION = "ego_motion.csv"
 TRANSLATION = ("x", "y", "z")
 QUATERNION = ("qw", "qx", "qy", "qz")
 ACCELERATION = ("ax", "ay", "az")
@@ -84,7 +85,8 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
         for name in ("pose_times", "pose_angles", "poses_of"):
             if getattr(drive.stated, name) is not None:
                 raise InputError(f"{path}: states all of its poses: remove {named(RigOptions, name)}")
-        return ReadPoses(read_ego_motion(path))
+        own = read_ego_motion(path)
+        return ReadPoses(own) if own.velocities_are_stated or path.name == EGO_MOTION else _doubted(own, path, drive)
     from bevcli.workshop.formats.poses import read_poses as read_poses_of_others
 
     poses = read_poses_of_others(path, drive)
@@ -96,6 +98,20 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
         raise InputError(f"{error}; other kinds of poses are in docs/other-inputs.md#poses") from None
 
 
+def _doubted(own: EgoMotion, path: Path, drive: DrivePoses) -> ReadPoses:
+    """Poses with the columns of ego_motion.csv, which others write too: believed unless images clearly contradict."""
+    from bevcli.workshop.formats.poses import read_poses as read_poses_of_others
+
+    try:
+        others = read_poses_of_others(path, drive)
+    except InputError:
+        others = None
+    states = {"pose_transform": "world_from_body", "pose_axes": "flu", "poses_of": "vehicle"}
+    readings = [PoseReading(states, own.translations, own.quaternions)]
+    readings += [replace(each, rank=each.rank + 1) for each in others.readings] if others else []
+    return ReadPoses(own, readings=tuple(readings) if len(readings) > 1 else (), file=path)
+
+
 def _is_own(path: Path) -> bool:
     """True for a file with the header of ego_motion.csv; and for one that is missing, which its reader says."""
     if not is_there(path):
@@ -104,7 +120,8 @@ def _is_own(path: Path) -> bool:
         return False
     with open_regular(path) as file:
         head = file.readline(1000)
-    return b"timestamp_ns" in head and b"qw" in head
+    names = [name.strip() for name in head.split(b",")]
+    return b"timestamp_ns" in head and b"qw" in head and (b"x" in names or path.name == EGO_MOTION)
 
 
 def read_ego_motion(path: Path) -> EgoMotion:

@@ -1,31 +1,44 @@
 """What a file of a rig or of poses may mean: its readings, each stated by values of options."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import permutations, product
+
+import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 
-AXES = {
-    "flu": "axes x forward, y left, z up",
-    "frd": "axes x forward, y right, z down",
-    "rfu": "axes x right, y forward, z up",
-    "rdf": "axes x right, y down, z forward",
-}
-CAMERA_AXES = {
-    "optical": "camera axes x right, y down, z forward",
-    "vehicle": "camera axes x forward, y left, z up",
-    "opengl": "camera axes x right, y up, z backward",
-}
+DIRECTIONS = {"f": "forward", "b": "backward", "l": "left", "r": "right", "u": "up", "d": "down"}
+ALL_AXES = [
+    "".join(letters) for axes in permutations(("fb", "lr", "ud")) for letters in product(*axes)
+]  # of a vehicle: the directions of x, y and z
+USUAL_AXES = ("flu", "frd", "rfu", "rdf")
+LEFT_HANDED = ("ruf", "fru")  # of Unity and Unreal
+CAMERA_AXES = {"optical": "rdf", "vehicle": "flu", "opengl": "rub", "unity": "ruf", "unreal": "fru"}
 ORDERS = {order: f"quaternion {' '.join(order)}" for order in ("wxyz", "xyzw")}
 ANGLES = {"vector": "rotation vectors"} | {unit: f"roll, pitch and yaw in {unit}" for unit in ("radians", "degrees")}
 POSE_ANGLES = {unit: f"yaw in {unit} counter-clockwise from x" for unit in ("radians", "degrees")} | {
     "compass": "heading in degrees clockwise from north", "compass-radians": "heading in radians clockwise from north",
+    "clockwise": "yaw in degrees clockwise from x", "clockwise-radians": "yaw in radians clockwise from x",
 }  # fmt: skip
-WORDS = {
-    "rig_axes": AXES, "pose_axes": AXES, "camera_axes": CAMERA_AXES, "rig_angles": ORDERS | ANGLES,
-    "pose_angles": ORDERS | POSE_ANGLES,
-}  # fmt: skip
+WORDS = {"rig_angles": ORDERS | ANGLES, "pose_angles": ORDERS | POSE_ANGLES}
+
+
+def ego_from_axes(letters: str) -> Array:
+    """(3, 3) from a frame with other axes to x forward, y left, z up; it mirrors left-handed ones.
+
+    Raises InputError for letters that are not of `ALL_AXES`.
+    """
+    if letters not in ALL_AXES:
+        raise InputError(f'axes "{letters:.20}" mean nothing (expected three letters such as flu, frd or rub)')
+    signed = [("flu".find(letter), "brd".find(letter)) for letter in letters]
+    return np.stack([np.eye(3)[plus] if plus >= 0 else -np.eye(3)[minus] for plus, minus in signed], axis=1)
+
+
+def is_left_handed(letters: str) -> bool:
+    """True for axes of which x times y is not z."""
+    return float(np.linalg.det(ego_from_axes(letters))) < 0
 
 
 @dataclass(frozen=True)
@@ -34,9 +47,11 @@ class Reading:
 
     Attributes:
         states: the options that state it, and their values, such as {"rig_axes": "rfu"}.
+        rank: 0 for a usual one; one of a higher rank is believed only where it fits much better.
     """
 
     states: Mapping[str, str]
+    rank: int = field(default=0, kw_only=True)
 
     def words(self, names: Sequence[str] = ()) -> str:
         """It in words. names: the options of interest; all by default."""
@@ -75,8 +90,12 @@ class PoseReading(Reading):
 def _word(name: str, value: str) -> str:
     if name == "poses_of":
         return f"of {value}" if value != "vehicle" else "of the vehicle"
-    if name == "rig_unit":
-        return f"translations in {value}"
+    if name in ("rig_unit", "pose_unit"):
+        return f"{'translations' if name == 'rig_unit' else 'positions'} in {value}"
+    if name.endswith("_axes"):
+        letters = zip("xyz", CAMERA_AXES.get(value, value), strict=True)
+        words = ", ".join(f"{axis} {DIRECTIONS[letter]}" for axis, letter in letters)
+        return f"{'camera axes' if name == 'camera_axes' else 'axes'} {words}"
     return WORDS.get(name, {}).get(value, value)
 
 

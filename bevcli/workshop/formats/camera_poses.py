@@ -16,7 +16,15 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z
 from bevcli.options import named
-from bevcli.sequences.files.readings import RigReading
+from bevcli.sequences.files.readings import (
+    ALL_AXES,
+    CAMERA_AXES,
+    LEFT_HANDED,
+    USUAL_AXES,
+    RigReading,
+    ego_from_axes,
+    is_left_handed,
+)
 from bevcli.sequences.options import RigOptions
 
 Direction = Literal["ego_from_camera", "camera_from_ego"]
@@ -32,21 +40,20 @@ FARTHEST_OFF = np.radians(70)  # of a viewing direction from that of the camera'
 SAME_SIDE, SAME_PLACE_M = np.radians(5), 0.15  # of a camera and of one on the other side of the vehicle
 SIDES = {"front|forward|ahead": 1, "back|rear": -1, "left": 1j, "right": -1j}  # in names, and where they are
 TOLERANCE = 1e-3
+SAME = 1e-3  # largest difference of matrices that are the same
 Fields: TypeAlias = dict[str, Any]
+PAIR = "rig_axes", "camera_axes"
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
-AXES = {
-    "optical": np.eye(3),
-    "vehicle": np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
-    "opengl": np.diag([1.0, -1.0, -1.0]),
-}
-# (3, 3) ego_from_body: from a vehicle frame with other axes to x forward, y left, z up.
-EGO_FROM_BODY = {
-    "flu": np.eye(3),
-    "frd": np.diag([1.0, -1.0, -1.0]),
-    "rfu": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    "rdf": AXES["vehicle"].T,
-}
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
+# Axes of the vehicle and of the cameras: usual ones, and others, both right-handed or both left-handed.
+USUAL = tuple(product(USUAL_AXES, ("optical", "vehicle")))
+OTHERS = tuple(
+    pair
+    for pair in product([axes for axes in ALL_AXES if not is_left_handed(axes)] + list(LEFT_HANDED), CAMERA_AXES)
+    if pair not in USUAL and is_left_handed(pair[0]) == is_left_handed(CAMERA_AXES[pair[1]])
+)
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+USUAL_UNITS = ("m", "cm", "mm")
 HEIGHT = (
     "if the origin is not on the ground, pass `height=1.5` (`--height 1.5`), the mean height of the cameras above it"
 )
@@ -86,7 +93,7 @@ class StatedPose:
             with np.errstate(invalid="ignore"):  # infinity is refused where the camera is made
                 return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
         body_from_axes = matrix if states["transform"] == "ego_from_camera" else inverse(matrix)
-        ego_from_body = rigid(rotation=EGO_FROM_BODY[states["rig_axes"]])
+        ego_from_body = rigid(rotation=ego_from_axes(states["rig_axes"]))
         return ego_from_body @ body_from_axes @ inverse(rigid(rotation=AXES[states["camera_axes"]])) @ then
 
     @property
@@ -143,14 +150,15 @@ def rig_readings(
         return (RigReading({}, {name: pose.ego_from_camera(states) for name, pose in poses.items()}),)
     _check_rotations(where, poses)
     rigs = [
-        RigReading(states, {name: pose.ego_from_camera(states) for name, pose in poses.items()})
-        for states in _states(free, {name: value for name, value in stated.items() if value is not None})
+        RigReading(states, {name: pose.ego_from_camera(states) for name, pose in poses.items()}, rank=rank)
+        for states, rank in _states(free, {name: value for name, value in stated.items() if value is not None})
     ]
-    reasons = [_impossible(rig.ego_from_camera, height_stated=height_stated) for rig in rigs]
+    reasons = [_impossible(rig, height_stated=height_stated) for rig in rigs]
     possible = _distinct([rig for rig, reason in zip(rigs, reasons, strict=True) if reason is None])
     by_name = next((pose.direction for pose in free if pose.direction), None)
-    if possible and stated.get("transform") is None:
-        possible = [rig for rig in possible if rig.states["transform"] == by_name] or possible
+    if stated.get("transform") is None:
+        named_ranks = {rig.rank for rig in possible if rig.states["transform"] == by_name}
+        possible = [rig for rig in possible if rig.states["transform"] == by_name or rig.rank not in named_ranks]
     if not possible:
         _refuse(f"{where}: {free[0].name}", rigs, reasons)
     return tuple(possible)
@@ -182,36 +190,40 @@ def _check_rotations(where: Path, poses: Mapping[str, StatedPose]) -> None:
                 )
 
 
-def _states(free: Sequence[StatedPose], stated: Mapping[str, str]) -> Iterator[dict[str, str]]:
-    """What transforms that are not exact may be. stated: what they are."""
+def _states(free: Sequence[StatedPose], stated: Mapping[str, str]) -> Iterator[tuple[dict[str, str], int]]:
+    """What transforms that are not exact may be, each with its rank. stated: what they are."""
     extent = max(float(np.linalg.norm(pose.any_matrix[:3, 3])) for pose in free)
     units = [unit for unit, metres in UNITS_M.items() if EXTENT_M[0] <= extent * metres <= EXTENT_M[1]] or ["m"]
     # A kind of rotation that not all cameras may have is none.
     kinds = [kind for kind in free[0].matrices if all(kind in pose.matrices for pose in free)] or [""]
-    axes = next(([pose.axes] for pose in free if pose.axes), ["optical", "vehicle"])
-    choices: dict[str, Sequence[str]] = {
-        "transform": DIRECTIONS, "rig_axes": tuple(EGO_FROM_BODY), "camera_axes": axes, "rig_angles": kinds,
-        "rig_unit": units,
-    }  # fmt: skip
-    choices |= {name: [value] for name, value in stated.items()}
-    for values in product(*choices.values()):
-        yield dict(zip(choices, values, strict=True))
+    choices: dict[str, Sequence[str]] = {"transform": DIRECTIONS, "rig_angles": kinds, "rig_unit": units}
+    choices |= {name: [value] for name, value in stated.items() if name in choices}
+    known = {"camera_axes": next((pose.axes for pose in free if pose.axes), None), **stated}
+    pairs = [
+        pair
+        for pair in (*USUAL, *OTHERS)
+        if known.get("rig_axes", pair[0]) == pair[0] and known["camera_axes"] in (None, pair[1])
+    ]
+    is_open = any(pair in USUAL for pair in pairs)
+    for axes, values in product(pairs, product(*choices.values())):
+        states = dict(zip(choices, values, strict=True))
+        rank = is_open and (axes not in USUAL or states["rig_unit"] not in (*USUAL_UNITS, stated.get("rig_unit")))
+        yield {"transform": states["transform"], **dict(zip(PAIR, axes, strict=True)), **states}, int(rank)
 
 
 def _distinct(readings: Sequence[RigReading]) -> list[RigReading]:
     """Readings without those that mean the same as an earlier one."""
-    kept: list[RigReading] = []
+    kept: list[tuple[RigReading, Array]] = []
     for reading in readings:
-        rig = reading.ego_from_camera
-        if not any(
-            all(np.allclose(rig[name], other.ego_from_camera[name], atol=1e-3) for name in rig) for other in kept
-        ):
-            kept.append(reading)
-    return kept
+        rig = np.stack(list(reading.ego_from_camera.values()))
+        if not any(np.abs(rig - other).max() < SAME for _, other in kept):
+            kept.append((reading, rig))
+    return [reading for reading, _ in kept]
 
 
-def _impossible(rig: Mapping[str, Array], *, height_stated: bool) -> tuple[str, str] | None:
+def _impossible(reading: RigReading, *, height_stated: bool) -> tuple[str, str] | None:
     """Why cameras cannot be on a vehicle: a code and a text. None if they can."""
+    rig = reading.ego_from_camera
     for name, pose in rig.items():
         forward, up = pose[:3, 2], -pose[:3, 1]
         if up[2] < LEAST_UPRIGHT:
@@ -226,6 +238,8 @@ def _impossible(rig: Mapping[str, Array], *, height_stated: bool) -> tuple[str, 
     outwards = ((places - places.mean(0)) * forwards).sum(1).mean()
     if outwards < -INWARDS_M:
         return "inwards", f"the cameras look inwards, by {-outwards:.2f} m on average"
+    if reading.rank and float(((places - places.mean(0)) * forwards)[:, 1].mean()) < -INWARDS_M:
+        return "sides", "the cameras on the left look to the right"
     for name, pose in rig.items():
         side = side_of(name)
         yaw = np.angle(complex(*pose[:2, 2]))

@@ -1,13 +1,20 @@
 """Readings of a file of poses: which body they are of, and in which direction. A vehicle drives along its x axis."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from itertools import product as combined
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid
-from bevcli.sequences.files.readings import PoseReading
-from bevcli.workshop.formats.camera_poses import EGO_FROM_BODY
+from bevcli.sequences.files.readings import (
+    ALL_AXES,
+    CAMERA_AXES,
+    LEFT_HANDED,
+    PoseReading,
+    ego_from_axes,
+    is_left_handed,
+)
 
 MOVING_M_S, MOVING_M = 1.0, 2.0  # slower steps, and drives with less distance, show no direction
 COMPARED = 10_000  # of a longer drive, every second, third, … pose is compared
@@ -16,33 +23,61 @@ FASTEST_M_S = 80.0
 ASIDE = np.radians(25.0)  # largest angle between x and the direction of motion, on average
 LEVEL = 0.9  # cosine of the largest tilt of a vehicle in a world with z up
 VEHICLE_AXES = ("flu", "frd", "rfu")
+OTHER_AXES = [axes for axes in ALL_AXES if axes not in VEHICLE_AXES and not is_left_handed(axes)] + list(LEFT_HANDED)
+OPPOSITE = dict(zip("fblrud", "bfrldu", strict=True))
 
 
 def of_bodies(
-    positions: Array, rotations: Mapping[str, Array], cameras: Sequence[str], stated: Mapping[str, str | None]
+    positions: Array,
+    rotations: Mapping[str, Array],
+    times_ns: NDArray[np.int64],
+    cameras: Mapping[str, Array | None],
+    stated: Mapping[str, str | None],
 ) -> Iterator[PoseReading]:
-    """The readings of poses, the usual first.
+    """The possible readings of poses, the usual first: those in which the vehicle drives along its x axis.
 
     Args:
         positions: (T, 3) metres.
         rotations: (T, 4) quaternions w, x, y, z by the value of `pose_angles`, "" where that is certain.
-        cameras: whose poses they may be, beside the vehicle's; in the order in which they are tried.
+        times_ns: (T,).
+        cameras: whose poses they may be, beside the vehicle's, in the order in which they are tried; (4, 4)
+            ego_from_camera, None where that is not known.
         stated: the options that state a reading; None for those that are not given.
     """
-    bodies = [{"pose_axes": axes, "poses_of": "vehicle"} for axes in VEHICLE_AXES]
-    bodies += [{"poses_of": camera} for camera in cameras]
-    for angles, quaternions in rotations.items():
-        for transform in ("world_from_body", "body_from_world"):
-            at, turned = positions, quaternions
-            if transform == "body_from_world":
-                turned = conjugate(quaternions)
-                at = -rotated(turned, positions)
-            for body in bodies:
-                states = {"pose_angles": angles, "pose_transform": transform, **body}
-                if all(value is None or states.get(name, value) == value for name, value in stated.items()):
-                    axes = body.get("pose_axes")
-                    poses = of_ego(at, turned, rigid(rotation=EGO_FROM_BODY[axes])) if axes else (at, turned)
-                    yield PoseReading(states, *poses, camera="" if axes else body["poses_of"])
+    rows = compared_rows(times_ns)
+    wanted = {name: value for name, value in stated.items() if value is not None}
+    axes_of = {"vehicle": [*VEHICLE_AXES, *OTHER_AXES], **{name: [*CAMERA_AXES.values()] for name in cameras}}
+    for angles, transform in combined(rotations, ("world_from_body", "body_from_world")):
+        quaternions, at = rotations[angles], positions
+        if transform == "body_from_world":
+            quaternions = conjugate(quaternions)
+            at = -rotated(quaternions, positions)
+        made: dict[tuple[bool, str], tuple[Array, Array]] = {}  # which all cameras share
+        for body, axes in ((body, axes) for body, each in axes_of.items() for axes in each):
+            states = {"pose_angles": angles, "pose_transform": transform, "pose_axes": axes, "poses_of": body}
+            if not wanted.items() <= states.items():
+                continue
+            is_vehicle = body == "vehicle"
+            known = None if is_vehicle else cameras[body]
+            if is_vehicle or known is not None:
+                few = _with_axes(at[rows], quaternions[rows], axes, is_vehicle=is_vehicle)
+                if not drives_along_x(*(few if known is None else of_ego(*few, known)), times_ns[rows]):
+                    continue
+            if (is_vehicle, axes) not in made:
+                made[is_vehicle, axes] = _with_axes(at, quaternions, axes, is_vehicle=is_vehicle)
+            rank = int(axes not in (VEHICLE_AXES if is_vehicle else ("rdf",)) and "pose_axes" not in wanted)
+            yield PoseReading(states, *made[is_vehicle, axes], camera="" if is_vehicle else body, rank=rank)
+
+
+def _with_axes(at: Array, quaternions: Array, axes: str, *, is_vehicle: bool) -> tuple[Array, Array]:
+    """Poses of a body with some axes as those of the vehicle, or of a camera with x right, y down, z forward."""
+    if is_left_handed(axes):  # the mirror image of a right-handed world
+        at, quaternions = at * (1, -1, 1), quaternions * (1, -1, 1, -1)
+        axes = axes[0] + OPPOSITE[axes[1]] + axes[2]
+    if is_vehicle:
+        return of_ego(at, quaternions, rigid(rotation=ego_from_axes(axes)))
+    turn = Pose.from_matrix(rigid(rotation=ego_from_axes(axes).T @ ego_from_axes("rdf"))).quaternion
+    return at, product(quaternions, turn[None])
 
 
 def of_ego(translations: Array, quaternions: Array, ego_from_body: Array) -> tuple[Array, Array]:

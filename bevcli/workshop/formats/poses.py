@@ -34,7 +34,6 @@ from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.pose_readings import (
     FASTEST_M_S,
     compared_rows,
-    drives_along_x,
     of_bodies,
     of_ego,
     quaternions_of_angles,
@@ -45,8 +44,9 @@ from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 _DIGITS = re.compile(r"(\d{1,18})(?:\.(\d{0,18}))?", re.ASCII)  # a time with all of its digits
-POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles")
-ANGLES = ("radians", "degrees", "compass", "compass-radians")
+POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
+ANGLES = ("radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # those of feet are stated
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
 
@@ -117,13 +117,6 @@ def _poses_of_ego(reading: PoseReading, rig: CameraRig) -> tuple[Array, Array]:
     """Translations (T, 3) and quaternions (T, 4) of the vehicle."""
     poses = reading.translations, reading.quaternions
     return of_ego(*poses, rig[reading.camera].ego_from_camera) if reading.camera else poses
-
-
-def _is_possible(reading: PoseReading, times_ns: NDArray[np.int64], drive: DrivePoses) -> bool:
-    """False where the vehicle does not drive along its x axis."""
-    rows = compared_rows(times_ns)
-    few = replace(reading, translations=reading.translations[rows], quaternions=reading.quaternions[rows])
-    return drive.rig_is_open or drives_along_x(*_poses_of_ego(few, drive.rig), times_ns[rows])
 
 
 def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
@@ -276,18 +269,39 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     rotations, cameras = _rotations(table, drive), list(drive.rig.names)
     stated = {name: getattr(drive.stated, name) for name in POSE_STATEMENTS[:3]}
     if stated["pose_axes"] is not None:
-        stated["poses_of"] = "vehicle"
+        stated["poses_of"] = stated["poses_of"] or "vehicle"
     of_gps = table.has("latitude", "longitude")
     if of_gps or not (table.has(*QUATERNION) or table.has(*MATRIX)):  # angles are those of a vehicle in the world
         cameras, stated["pose_transform"] = [], stated["pose_transform"] or "world_from_body"
     if of_gps:
         stated["pose_axes"] = stated["pose_axes"] or "flu"
-    readings = (
-        each for each in of_bodies(positions, rotations, cameras, stated) if _is_possible(each, times_ns, drive)
-    )
     zeroth = next((name for name in cameras if re.search("(?<![0-9])0+$", name)), "")
     zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
-    yield from sorted(readings, key=lambda each: table.has(*MATRIX) and each.camera != zeroth)
+    known = {name: None if drive.rig_is_open else drive.rig[name].ego_from_camera for name in cameras}
+    readings = []
+    for unit in _units(positions, times_ns, drive):
+        of_unit = of_bodies(UNITS_M[unit] * positions, rotations, times_ns, known, stated)
+        for each in of_unit:
+            rank = each.rank + int(drive.stated.pose_angles is None and _is_unusual(each.states["pose_angles"], table))
+            states = {**each.states, **({} if unit == "m" else {"pose_unit": unit})}
+            readings.append(replace(each, states=states, rank=rank))
+    yield from sorted(readings, key=lambda each: (each.rank, table.has(*MATRIX) and each.camera != zeroth))
+
+
+def _units(positions: Array, times_ns: NDArray[np.int64], drive: DrivePoses) -> list[str]:
+    """The units that positions may have: other ones than metres where a vehicle would be too fast."""
+    if drive.stated.pose_unit is not None:
+        return [drive.stated.pose_unit]
+    rows = compared_rows(times_ns)
+    lengths = np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)
+    speed = float(np.median(lengths / np.maximum(np.diff(times_ns[rows]), 1))) * 1e9 if len(lengths) else 0.0
+    return ["m"] if speed < FASTEST_M_S else ["cm", "mm"]
+
+
+def _is_unusual(angles: str, table: Table) -> bool:
+    """True for angles that are seldom meant by a name of a column."""
+    is_of_north = table.has("heading") or table.has("latitude")
+    return angles.startswith("clockwise") or (angles.startswith("compass") and not is_of_north)
 
 
 def _rotations(table: Table, drive: DrivePoses) -> dict[str, Array]:
@@ -332,12 +346,9 @@ def _of_angles(table: Table, drive: DrivePoses) -> dict[str, Array]:
     if table.has("heading", "yaw"):
         raise InputError(f"{table.path}: has a column of yaw and one of heading: remove one")
     angles, of_gps = table.numbers("roll", "pitch", name), table.has("latitude")
-    kinds = ["radians", "degrees"]
-    if name == "heading" or of_gps:
-        kinds += ["compass", "compass-radians"]
+    kinds = list(ANGLES)
     if name == "heading" and of_gps:
-        kinds.reverse()
-        kinds.sort(key=lambda kind: kind != "compass")
+        kinds.sort(key=lambda kind: (kind != "compass", kind != "compass-radians"))
     if mark := re.search(r"[_\[( ](deg|rad)", table.columns[name]):
         kinds = [kind for kind in kinds if ("rad" in kind) == (mark[1] == "rad")]
     if np.abs(angles).max() > LARGEST_RADIANS:
@@ -345,7 +356,7 @@ def _of_angles(table: Table, drive: DrivePoses) -> dict[str, Array]:
     rotations = {}
     for kind in [drive.stated.pose_angles] if drive.stated.pose_angles in ANGLES else kinds:
         roll, pitch, yaw = (angles if "rad" in kind else np.radians(angles)).T
-        if kind.startswith("compass"):
-            pitch, yaw = -pitch, np.pi / 2 - yaw
+        if kind.startswith(("compass", "clockwise")):
+            pitch, yaw = -pitch, (np.pi / 2 if kind.startswith("compass") else 0) - yaw
         rotations[kind] = quaternions_of_angles(roll, pitch, yaw)
     return rotations

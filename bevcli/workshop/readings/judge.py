@@ -25,14 +25,19 @@ from bevcli.workshop.readings.heights import height_above_road
 from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
 from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
 
-SOUND_PX = 2.5  # largest residual of a reading that is believed, reduced pixels
+SOUND_PX = (2.5, 1.0, 0.7)  # largest residual of a reading that is believed, reduced pixels, by its rank
 CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger
+NEAR, NEAR_PX = 1.25, 0.05  # the same, of readings of which the usual one is believed
+FLOOR_PX = 0.3  # no other reading is clearly better than one with this
+UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the only one
+LOWEST_M = -0.2  # mean height of usual cameras above the origin, which may be at a roof
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
 FEWEST_PAIRS = 2  # of images, that decide
+MOST_RANK = 4  # of a rig and poses
 AROUND_NS = 10**9  # before and after the frames, as images may be a little off their times
 CHORD_NS, CHORDS = 500_000_000, 60  # of short steps, by which readings are compared
 MOST_SLOW = 0.9  # share of the steps that must not be too fast
@@ -70,6 +75,19 @@ class Candidate:
         return _alike(*(np.array(rig).reshape(-1, 4, 4) for rig in rigs)) and _alike(self.way, other.way)
 
     @property
+    def rank(self) -> int:
+        """That of both readings: 0 for usual ones."""
+        is_below = (
+            self.rig is not None and np.mean([pose[2, 3] for pose in self.rig.ego_from_camera.values()]) < LOWEST_M
+        )
+        return sum(each.rank for each in (self.rig, self.poses) if each) + int(is_below)
+
+    @property
+    def is_sound(self) -> bool:
+        """True where the images fit."""
+        return self.residual_px <= SOUND_PX[min(self.rank, len(SOUND_PX) - 1)]
+
+    @property
     def is_forward(self) -> bool:
         """False for a vehicle that drives backwards."""
         return not len(self.way) or float(self.way[:, 0, 3].sum()) <= 0
@@ -103,7 +121,7 @@ def decide(draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOp
             poses_of = {name: rigid((0, 0, up)) @ pose for name, pose in reading.ego_from_camera.items()}
             reading = replace(reading, ego_from_camera=poses_of)
         draft = _with_rig(draft, reading, evidence, raised)
-    if chosen.poses is not None:
+    if chosen.poses is not None and chosen.poses.note:
         assert poses.motion is not None
         read = of_reading(chosen.poses, poses.motion.timestamps_ns, draft.rig)
         notes = tuple(f"{note} ({evidence})" if evidence and chosen.rig is None else note for note in read.notes)
@@ -148,8 +166,17 @@ class _Judged:
             self._times, *(np.concatenate([[0], np.cumsum(each)]) for each in (np.min(ways, axis=0), turned))
         )
 
-    def candidates(self, draft: RigDraft, poses: ReadPoses) -> Iterator[Candidate]:
-        """All possible pairs of readings, those of the usual rig first."""
+    def candidates(self, draft: RigDraft, poses: ReadPoses) -> list[Candidate]:
+        """The possible pairs of readings, those that fit best first; those of a high rank where no others fit."""
+        found: list[Candidate] = []
+        for rank in range(MOST_RANK + 1):
+            found = sorted([*found, *self._of_rank(draft, poses, rank)], key=lambda each: each.residual_px)
+            is_usual = bool(found) and found[0].rank <= rank
+            if is_usual and (not self._pairs or found[0].residual_px <= FLOOR_PX or (rank and found[0].is_sound)):
+                break
+        return found
+
+    def _of_rank(self, draft: RigDraft, poses: ReadPoses, rank: int) -> Iterator[Candidate]:
         rigs: list[RigReading | None] = list(draft.readings) or [None]
         readings: list[PoseReading | None] = list(poses.readings) or [None]
         at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64).reshape(-1, 2)
@@ -159,6 +186,8 @@ class _Judged:
             for index, track in _tracks(poses, self._times).items()
         }
         for rig, (index, reading) in product(rigs, enumerate(readings)):
+            if sum(each.rank for each in (rig, reading) if each) != rank:
+                continue
             stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
             where = stated if rig is None else rig.ego_from_camera
             cameras = np.array([where[pair.camera.name] for pair in self._pairs]).reshape(-1, 4, 4)
@@ -182,22 +211,37 @@ class _Judged:
 
     def chosen(self) -> tuple[Candidate, str]:
         """The candidate that the images show, and the evidence in words. Raises InputError."""
-        found = sorted(self.candidates(self._draft, self._poses), key=lambda each: each.residual_px)
+        found = self.candidates(self._draft, self._poses)
         if not found:
             options = ", ".join(named(RigOptions, name) for name in ("rig_axes", "pose_axes", "poses_of"))
             raise InputError(
                 f"{self._files(BOTH)}: in no reading the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
                 f"correct the poses, or state what they are by {options} or {named(RigOptions, 'pose_transform')}"
             )
-        best = found[0]
-        left = [each for each in found if each.residual_px <= CLEAR * best.residual_px + CLEAR_PX]
-        unsound = best.residual_px > SOUND_PX or len(self._pairs) < FEWEST_PAIRS
-        alike = left = found if unsound else left
+        near, clear = (times * found[0].residual_px + more for times, more in ((NEAR, NEAR_PX), (CLEAR, CLEAR_PX)))
+        best = min(found, key=lambda each: (each.residual_px > near, each.rank))
+        usual = [each for each in found if each.rank <= best.rank]
+        unsound = not best.is_sound or len(self._pairs) < FEWEST_PAIRS
+        alike = left = usual if unsound else [each for each in usual if each.residual_px <= clear]
         left = [each for index, each in enumerate(left) if not any(each.is_like(other) for other in left[:index])]
         if unsound and differing([each.whole for each in left]) == ["pose_transform"]:
             left = [each for each in left if each.is_forward] or left
+        if len(left) > 1 and not unsound:
+            left = [each for each in left if self._missing_height(each) == 0] or left
         if len(left) > 1:
             return self._on_both_sides(left, alike)
+        is_stated = bool(self._draft.others or self._poses.others)
+        if (
+            unsound
+            and len(self._pairs) >= FEWEST_PAIRS
+            and not is_stated
+            and (best.rank or best.residual_px > UNFIT_PX)
+        ):
+            raise InputError(
+                f"{self._files(BOTH)}: the images do not fit the only reading, {best.whole.words()} (residual "
+                f"{best.residual_px:.1f} px): correct the file, pass `odometry=True` (`--odometry`) in place of the "
+                "poses, or `image_check=False` (`--no-image-check`) to read it so"
+            )
         others = [each for each in found if not each.is_like(left[0])]
         if not others or not np.isfinite(best.residual_px):
             return left[0], ""
@@ -211,8 +255,8 @@ class _Judged:
             return ""
         draft = replace(self._draft, readings=self._draft.others or self._draft.readings)
         poses = replace(self._poses, readings=self._poses.others or self._poses.readings)
-        fitting = min(self.candidates(draft, poses), key=lambda each: each.residual_px, default=chosen)
-        if fitting.residual_px > SOUND_PX or chosen.residual_px < CONTRADICTING * fitting.residual_px + CLEAR_PX:
+        fitting = next(iter(self.candidates(draft, poses)), chosen)
+        if not fitting.is_sound or chosen.residual_px < CONTRADICTING * fitting.residual_px + CLEAR_PX:
             return ""
         flags = fitting.whole.flags(differing([chosen.whole, fitting.whole]))
         return (
@@ -262,10 +306,8 @@ class _Judged:
         """
         assert chosen.rig is not None
         heights = [float(pose[2, 3]) for pose in chosen.rig.ego_from_camera.values()]
-        points, seen = self._points, None
-        if points is not None and self._poses.motion is not None:
-            seen = height_above_road(points, chosen.cameras, chosen.steps)
-        if seen is None or seen.clearness < CLEAR_HEIGHT:
+        up = self._missing_height(chosen)
+        if up is None:
             if max(heights) > LOWEST_OF_GROUND_M and min(heights) > 0:
                 return 0.0, ""
             raise InputError(
@@ -273,14 +315,21 @@ class _Judged:
                 "the images do not tell its height: pass `--height 1.5` (`height`), the mean height of the cameras "
                 f"above the road, or `--height {max(np.mean(heights), 0.1):.2f}` where the origin is on the road"
             )
-        stated = float(np.mean(chosen.cameras[:, 2, 3]))
-        if abs(seen.height_m - stated) <= max(SAME_HEIGHT_M, SAME_HEIGHT * stated):
+        if not up:
             return 0.0, ""
+        seen = f"{np.mean(heights) + up:.2f} m above the road"
+        return up, f"; raised by {up:.2f} m, as the images show the cameras {seen}"
+
+    def _missing_height(self, chosen: Candidate) -> float | None:
+        """By how much the cameras are higher above the road than the file states, metres; None where it is not seen."""
+        if self._points is None or self._poses.motion is None:
+            return None
+        seen = height_above_road(self._points, chosen.cameras, chosen.steps)
+        if seen is None or seen.clearness < CLEAR_HEIGHT:
+            return None
+        stated = float(np.mean(chosen.cameras[:, 2, 3]))
         up = seen.height_m - stated
-        return (
-            up,
-            f"; raised by {up:.2f} m, as the images show the cameras {np.mean(heights) + up:.2f} m above the road",
-        )
+        return up if abs(up) > max(SAME_HEIGHT_M, SAME_HEIGHT * stated) else 0.0
 
 
 def _tracks(poses: ReadPoses, times_ns: NDArray[np.int64]) -> dict[int, Poses]:
