@@ -4,7 +4,7 @@ import json
 import random
 import re
 import shutil
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,10 @@ from bevcli.sequences.open import open_sequence
 
 EGO_FROM_OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 EGO_FROM = {
-    "flu": np.eye(3), "frd": np.diag([1.0, -1, -1]), "rfu": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    "flu": np.eye(3), "frd": np.diag([1.0, -1, -1]), "rfu": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+    "ruf": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),
 }  # fmt: skip
+OPTICAL_FROM = {"optical": np.eye(3), "opengl": np.diag([1.0, -1, -1]), "unity": np.diag([1.0, -1, 1])}
 UNITS = {"m": 1, "cm": 100, "mm": 1000}
 CHOICES = {
     "rig_axes": ("flu", "frd", "rfu"), "transform": ("T_ego_cam", "T_cam_ego", "T"),
@@ -32,6 +34,7 @@ class Convention:
     """How a program states a drive; the defaults are those of bevcli."""
 
     rig_axes: str = "flu"
+    camera_axes: str = "optical"
     transform: str = "T_ego_cam"
     rotation: str = "matrix"
     unit: str = "m"
@@ -44,7 +47,7 @@ class Convention:
     def drawn(cls, seed: int) -> "Convention":
         """One of all conventions."""
         generator = random.Random(seed)
-        drawn = cls(**{field.name: generator.choice(CHOICES[field.name]) for field in fields(cls)})
+        drawn = cls(**{name: generator.choice(choices) for name, choices in CHOICES.items()})
         if drawn.file == "yaw":  # of the vehicle in the world
             return replace(drawn, body=generator.choice(("flu", "frd")), pose_transform="world_from_body")
         return drawn
@@ -78,7 +81,7 @@ def write(truth: Drive, folder: Path, convention: Convention, names=None) -> dic
 
 def _pose(ego_from_camera: np.ndarray, convention: Convention) -> dict[str, object]:
     lowered = rigid(np.eye(3), (0, 0, -convention.origin_m)) @ ego_from_camera
-    matrix = rigid(EGO_FROM[convention.rig_axes].T) @ lowered
+    matrix = rigid(EGO_FROM[convention.rig_axes].T) @ lowered @ rigid(OPTICAL_FROM[convention.camera_axes])
     if convention.rotation == "rpy" and convention.rig_axes == "flu":  # of the body of the camera
         matrix = matrix @ rigid(EGO_FROM_OPTICAL.T)
     elif convention.transform != "T_ego_cam" and convention.rotation != "rpy":

@@ -380,7 +380,7 @@ def test_every_reading_that_is_named_can_be_stated(tmp_path):
     for choice in choices:
         words = choice.split()
         stated = {flag[2:].replace("-", "_"): value for flag, value in zip(words[::2], words[1::2], strict=True)}
-        assert len(read(path, **stated).readings) == 1
+        assert [each.rank for each in read(path, **stated).readings].count(0) == 1
 
 
 def test_a_height_moves_a_rig_whose_origin_is_not_on_the_ground(tmp_path):

@@ -78,8 +78,9 @@ class RigDraft:
 
     def certain(self) -> "RigDraft":
         """The draft itself. Raises InputError where its poses have several readings."""
-        if len(self.readings) > 1:
-            raise question(self.file, "no images decide between them", self.readings)
+        usual = [reading for reading in self.readings if reading.rank == self.readings[0].rank]
+        if len(usual) > 1:
+            raise question(self.file, "no images decide between them", usual)
         return self
 
 

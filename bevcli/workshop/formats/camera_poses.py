@@ -46,7 +46,8 @@ PAIR = "rig_axes", "camera_axes"
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
 AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
 # Axes of the vehicle and of the cameras: usual ones, and others, both right-handed or both left-handed.
-USUAL = tuple(product(USUAL_AXES, ("optical", "vehicle")))
+USUAL_CAMERAS = "optical", "vehicle"
+USUAL = tuple(product(USUAL_AXES, USUAL_CAMERAS))
 OTHERS = tuple(
     pair
     for pair in product([axes for axes in ALL_AXES if not is_left_handed(axes)] + list(LEFT_HANDED), CAMERA_AXES)
@@ -161,7 +162,7 @@ def rig_readings(
         possible = [rig for rig in possible if rig.states["transform"] == by_name or rig.rank not in named_ranks]
     if not possible:
         _refuse(f"{where}: {free[0].name}", rigs, reasons)
-    return tuple(possible)
+    return tuple(sorted(possible, key=lambda rig: rig.rank))
 
 
 def _refuse(where: str, rigs: Sequence[RigReading], reasons: Sequence[tuple[str, str] | None]) -> None:
@@ -204,11 +205,14 @@ def _states(free: Sequence[StatedPose], stated: Mapping[str, str]) -> Iterator[t
         for pair in (*USUAL, *OTHERS)
         if known.get("rig_axes", pair[0]) == pair[0] and known["camera_axes"] in (None, pair[1])
     ]
-    is_open = any(pair in USUAL for pair in pairs)
     for axes, values in product(pairs, product(*choices.values())):
         states = dict(zip(choices, values, strict=True))
-        rank = is_open and (axes not in USUAL or states["rig_unit"] not in (*USUAL_UNITS, stated.get("rig_unit")))
-        yield {"transform": states["transform"], **dict(zip(PAIR, axes, strict=True)), **states}, int(rank)
+        is_usual = (
+            axes[0] in (*USUAL_AXES, stated.get("rig_axes"))
+            and axes[1] in (*USUAL_CAMERAS, known["camera_axes"])
+            and states["rig_unit"] in (*USUAL_UNITS, stated.get("rig_unit"))
+        )
+        yield {"transform": states["transform"], **dict(zip(PAIR, axes, strict=True)), **states}, int(not is_usual)
 
 
 def _distinct(readings: Sequence[RigReading]) -> list[RigReading]:
