@@ -231,8 +231,9 @@ class RigOptions:
     )
     pose_angles: PoseAngles | None = option(
         default=None,
-        help="Unit of the angles in --ego-motion (compass: degrees clockwise from north; clockwise: degrees clockwise "
-        "from x), or the order of its quaternions. Default: what the images show.",
+        help="Angles in --ego-motion: radians or degrees, compass or compass-radians (clockwise from north), clockwise "
+        "or clockwise-radians (from x); or the order of its quaternions, wxyz or xyzw. Default: what the images show.",
+        metavar="ANGLES",
     )
     pose_unit: Literal["m", "cm", "mm", "ft"] | None = option(
         default=None, help="Unit of the positions in --ego-motion. Default: metres, if a vehicle can be as fast."
