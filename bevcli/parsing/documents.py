@@ -94,8 +94,6 @@ def parse_json(
         raise InputError(f"{path}: {position}: broken JSON: {error.msg}") from None
     except UnicodeError as error:
         raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
-    except RecursionError:
-        raise InputError(f"{path}: is nested too deeply to be read as JSON") from None
 
 
 def first_twice(keys: Sequence[Hashable]) -> int | None:
