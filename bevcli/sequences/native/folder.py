@@ -67,10 +67,10 @@ class FolderDrive(ListedDrive):
         poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries), is_open))
         self.understood, left_out, advice = "", "", "add ego-motion, or remove the frame"
         if not entries:
-            from bevcli.workshop.formats import camera_names, matching, unlisted
+            from bevcli.workshop.formats import matching, unlisted
 
             if not (path / "videos").is_dir():
-                used, left_out = camera_names.cameras_with_images(rig.names, path)
+                used, left_out = matching.cameras_with_images(rig.names, path)
                 rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             frames = unlisted.find_frames(path, rig.names, own, motion, has_poses=has_poses)

@@ -21,7 +21,6 @@ from bevcli.sequences.files.calibration_file import RigDraft, parse_camera
 from bevcli.sequences.files.json_fields import parse_transform, require, transform_to_json
 from bevcli.sequences.files.readings import RigReading
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.formats.camera_names import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.camera_poses import (
     Cameras,
     Fields,
@@ -34,6 +33,7 @@ from bevcli.workshop.formats.camera_poses import (
 from bevcli.workshop.formats.information_files import read_information
 from bevcli.workshop.formats.kitti_drive import KITTI_FILES, read_kitti
 from bevcli.workshop.formats.markup import YAML_BYTES
+from bevcli.workshop.formats.matching import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.named_calibration import SUFFIXES, read_document, read_named
 from bevcli.workshop.formats.other_calibrations import read_colmap, read_nerfstudio, read_vins_fusion
 
