@@ -210,6 +210,13 @@ def test_the_numbers_are_in_the_json():
     assert {"score", "low", "high", "kept", "cameras", "distances", "shifts", "worst_frames", "notes"} <= set(content)
 
 
+def test_the_numbers_of_a_reference_stand_beside():
+    lines = held(CARS, seen(CARS[:3]), frames=8).table(held(CARS, seen(CARS), frames=2)).splitlines()
+    rows = {cells[0]: cells[1:] for line in lines if (cells := line.split())}
+    assert (rows["agreement"][-2:], rows["reference"][-2:]) == (["8", "8"], ["2", "2"])
+    assert rows["people"] == ["-", "0", "0.00", "8", "1.00", "2", "1.00", "2"]
+
+
 def test_what_a_run_saw_is_read_back(tmp_path: Path):
     with ImageBoxesWriter(tmp_path / "image_boxes.csv") as file:
         file.write(FrameStamp(3, "a", 7), {"front": BICYCLE})

@@ -111,6 +111,12 @@ def test_a_wrong_focal_length_is_named_with_its_factor():
     assert "1.15 times" in finding.message
 
 
+def test_mirrored_poses_are_one_finding():
+    flip = np.diag([1.0, -1, 1])
+    rows = replace(ROWS, rotations=flip @ ROWS.rotations @ flip, positions=ROWS.positions @ flip)
+    assert [each.code for each in camera_findings(SOUND, rows, RIG)] == ["motion-axes"]
+
+
 @pytest.mark.parametrize(("axis", "words"), [(1, "2.0° further left"), (0, "2.0° further down")])
 def test_a_wrong_rotation_is_named_with_its_angle(axis: int, words: str):
     turn = Rotation.from_rotvec(np.radians(2) * np.eye(3)[axis]).as_matrix()  # the stated camera looks right, or up

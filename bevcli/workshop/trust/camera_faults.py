@@ -28,7 +28,9 @@ PARALLAX_PX = 2.0  # a point that moves less has no depth
 SCALE_PX = 0.5  # a misfit of one point that counts half
 USUAL_SHARE = 0.6  # of points of the middle camera; below it the poses are too inexact to judge single cameras by
 LEAST_SHARE = 0.55  # of points that fit after a mistake is undone
-EXCHANGED, GAIN, SMALL = 0.25, 0.1, 0.03  # by how much more, if images are exchanged; mirrored or late; of others
+EXCHANGED, GAIN, SMALL = 0.2, 0.1, 0.03  # by how much more, if images of two are exchanged; mirrored or late; of others
+SURELY = 0.25  # the same of mirrored poses, and of late images where poses are inexact
+FLIP = np.diag([1.0, -1.0, 1.0])
 COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
 TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
 LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
@@ -125,32 +127,43 @@ def _joined(parts: Items[CameraPoints]) -> CameraPoints:
 
 
 def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: CameraRig) -> tuple[Finding, ...]:
-    """One finding for each camera whose points do not fit the poses, and fit where a mistake is undone.
+    """One finding of each camera whose points do not fit the poses, and fit where a mistake is undone; or of the poses.
 
     points: of `points_of`. rig: all cameras, also those without points.
     """
     stated = {name: share(each, rows) for name, each in points.items()}
+    flipped = replace(rows, rotations=FLIP @ rows.rotations @ FLIP, positions=rows.positions @ FLIP)
+    before, undone = (_middle([share(each, of) for each in points.values()]) for of in (rows, flipped))
+    if len(points) > 1 and undone - before >= SURELY:  # of one camera, the images may be mirrored
+        found = f"the points of the middle camera fit by {before:.2f} of 1 as stated, {undone:.2f} with y mirrored"
+        advice = "mirror y of positions and rotations, or turn z up"
+        message = "the poses are left-handed, or their z points down"
+        return (Finding("motion-axes", "error", None, message, found, "x forward, y left, z up", advice),)
     findings, left = list[Finding](), dict(points)
     for gained, first, second in sorted(_exchanges(points, rows, stated, rig), reverse=True):
         if first in left and (second in left or second not in points):
             message, advice = f"its images are those of {second}, and the other way round", "exchange them"
             findings.append(_finding("images-exchanged", first, message, stated[first], gained, advice))
             left = {name: each for name, each in left.items() if name not in (first, second)}
-    usual = sorted([stated[name] for name in left] or [1.0])[len(left) // 2]
-    are_inexact = usual < USUAL_SHARE
-    if are_inexact:
-        message = "late images, focal lengths and rotations of single cameras were not checked"
+    usual = _middle([stated[name] for name in left])
+    only_coarse = usual < USUAL_SHARE or bool(findings)  # a camera that is off a little can wait for the exchanged ones
+    if usual < USUAL_SHARE:
+        message = "focal lengths and rotations of single cameras were not checked"
         found = f"the points of the middle camera fit the motion of the vehicle by {usual:.2f} of 1"
         findings.append(Finding("cameras-unchecked", "info", None, message, found, f"{USUAL_SHARE} or more"))
     for name, each in left.items():
         before = cost(each, rows)
-        tried = _undone(each, rows, _interval_ns(points), only_coarse=are_inexact)
+        tried = _undone(each, rows, _interval_ns(points), only_coarse=only_coarse)
         told = [one for one in tried if one.is_told(rows, stated[name], before)]
         if told:
             likeliest = min(told, key=lambda one: cost(one.points, rows))
             undone = share(likeliest.points, rows)
             findings.append(_finding(likeliest.code, name, likeliest.message, stated[name], undone, likeliest.advice))
     return tuple(findings)
+
+
+def _middle(shares: list[float]) -> float:
+    return sorted(shares or [1.0])[len(shares) // 2]
 
 
 def _finding(code: str, camera: str, message: str, stated: float, undone: float, advice: str) -> Finding:
@@ -175,8 +188,10 @@ def _exchanges(
         gained = [(share(first.seen_by(there), rows), stated[name])]
         if other.name in points:
             gained.append((share(points[other.name].seen_by(first.camera), rows), stated[other.name]))
-        if all(undone >= LEAST_SHARE and undone - before >= EXCHANGED for undone, before in gained):
-            yield min(undone for undone, _ in gained), name, other.name
+        gains = [undone - before for undone, before in gained]
+        fits = len(gained) == 2 or gained[0][0] >= LEAST_SHARE  # two that fit each other's camera need not fit well
+        if fits and min(gains) >= GAIN / 2 and np.mean(gains) >= EXCHANGED:
+            yield float(np.mean([undone for undone, _ in gained])), name, other.name
 
 
 @dataclass(frozen=True)
@@ -198,13 +213,14 @@ class _Undone:
 
 
 def _undone(points: CameraPoints, rows: Poses, interval_ns: int, *, only_coarse: bool) -> Iterator[_Undone]:
-    """The mistakes that one camera may have, undone. only_coarse: mirrored images alone."""
+    """The mistakes that one camera may have, undone. only_coarse: mirrored and late images alone."""
     yield _Undone(points.mirrored(), "images-mirrored", "its images are mirrored", "mirror them", GAIN)
+    for late_ns in (interval_ns, -interval_ns):
+        message, gain = f"its images are {abs(late_ns) / 1e6:.0f} ms too ", SURELY if only_coarse else GAIN
+        message += "late" if late_ns > 0 else "early"
+        yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", gain)
     if only_coarse:
         return
-    for late_ns in (interval_ns, -interval_ns):
-        message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {'late' if late_ns > 0 else 'early'}"
-        yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", GAIN)
     factor = best_focal(points, rows)
     if LEAST_LONGER <= abs(np.log(factor)) < LENGTHS[-1]:  # the longest and shortest one tried are no measurement
         message = f"the stated focal length is {1 / factor:.2f} times the one that the images show"
