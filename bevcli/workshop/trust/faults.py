@@ -38,7 +38,7 @@ STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'
 SURE, REPEATED_M = 0.3, 2.0  # boxes that are looked for: score, error
 LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
 BEST = 15  # boxes of a frame whose scores are averaged
-BETTER = 0.015  # what the right order of colours gains of it; none of the frames may lose
+BETTER = 0.015  # what the right order of colours gains of it; the wrong one loses 0.03 to 0.11
 LEAST_FOUND = 0.3  # share of what the witness sees that sound weights find: 0.4 or more in 39 runs
 
 
@@ -147,23 +147,25 @@ def frame_boxes(model: Model, drive: Drive, *, temporal: bool = False) -> list[F
 
 
 def color_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
-    """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is."""
-    range_m = model.config.bev_grid.nearest_side_m
-    sides = boxes, frame_boxes(model, ReversedColors(drive))
-    stated, undone = (np.array([confidence(frame, range_m) for frame in side]) for side in sides)
-    if not (np.mean(undone - stated) >= BETTER and (undone >= stated).all()):
+    """The finding about images whose colour channels are in the wrong order. boxes: of the drive as it is.
+
+    None of a model with a detector: on some sound drives it finds more in wrong colours than on others in right ones.
+    """
+    if model.config.image_classes:
         return ()
-    found = (
-        f"mean of the 15 best scores {stated.mean():.2f} as they are, {undone.mean():.2f} with red and blue exchanged"
-    )
+    range_m = model.config.bev_grid.nearest_side_m
+    stated, undone = (confidence(each, range_m) for each in (boxes, frame_boxes(model, ReversedColors(drive))))
+    if not undone - stated >= BETTER:
+        return ()
+    found = f"mean of the 15 best scores {stated:.2f} as they are, {undone:.2f} with red and blue exchanged"
     message, advice = "red and blue are exchanged in the images", "state the order of the channels, or exchange them"
     return (Finding("color-order", "error", None, message, found, "", advice),)
 
 
-def confidence(frame: FrameBoxes, range_m: float) -> float:
+def confidence(frames: Sequence[FrameBoxes], range_m: float) -> float:
     """Mean of the 15 best scores of a frame within a distance, 0 to 1; missing boxes count as 0."""
-    near = frame.boxes[np.linalg.norm(frame.boxes.centers[:, :2], axis=1) < range_m]
-    return 0.0 if near.scores is None else float(np.sort(near.scores)[-BEST:].sum()) / BEST
+    near = (each.boxes[np.linalg.norm(each.boxes.centers[:, :2], axis=1) < range_m] for each in frames)
+    return float(np.mean([np.sort(boxes.scores)[-BEST:].sum() / BEST for boxes in near if boxes.scores is not None]))
 
 
 def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
