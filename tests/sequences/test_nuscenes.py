@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -335,6 +336,25 @@ def test_a_damaged_cache_is_built_anew(cached, content):
     again, note = tables.open_index(cached / "v1.0-trainval")
     assert "is cached in" in note
     np.testing.assert_array_equal(again.samples.times_us, index.samples.times_us)
+
+
+def test_a_cache_that_cannot_be_written_leaves_nothing(cached, monkeypatch):
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    _, note = tables.open_index(cached / "v1.0-trainval")
+    assert "cannot be cached (No space left on device)" in note
+    assert not list((cached / "cache/bevcli/nuscenes").iterdir())
+
+
+def test_a_file_in_the_place_of_the_cache_is_replaced(cached):
+    tables.open_index(cached / "v1.0-trainval")
+    (folder,) = (cached / "cache/bevcli/nuscenes").iterdir()
+    shutil.rmtree(folder)
+    folder.write_text("no folder")
+    _, note = tables.open_index(cached / "v1.0-trainval")
+    assert "is cached in" in note
 
 
 def test_nothing_is_written_into_the_dataset(cached):

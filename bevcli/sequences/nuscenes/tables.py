@@ -38,7 +38,7 @@ from bevcli.sequences.nuscenes.index import (
     Scenes,
     Sensors,
 )
-from bevcli.writing import UNFINISHED, remove_abandoned, user_cache
+from bevcli.writing import UNFINISHED, remove_abandoned, remove_parts, user_cache
 
 Row: TypeAlias = dict[str, Any]
 BATCH_BYTES = 16 << 20
@@ -425,12 +425,15 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
     unfinished = folder.with_name(f"{folder.name}{UNFINISHED}{os.getpid()}")
     remove_abandoned(folder.parent, f"{folder.name}{UNFINISHED}")
     unfinished.mkdir(parents=True)
-    for group, table in vars(index).items():
-        for name, values in vars(table).items():
-            np.save(unfinished / f"{group}.{name}.npy", values, allow_pickle=False)
-    (unfinished / FINGERPRINT).write_text(fingerprint, encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    unfinished.rename(folder)
+    try:
+        for group, table in vars(index).items():
+            for name, values in vars(table).items():
+                np.save(unfinished / f"{group}.{name}.npy", values, allow_pickle=False)
+        (unfinished / FINGERPRINT).write_text(fingerprint, encoding="utf-8")
+        remove_parts(folder.parent, [folder.name])
+        unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)  # of a full disk, or where another process was faster
 
 
 def _load(folder: Path) -> NuScenesIndex:
