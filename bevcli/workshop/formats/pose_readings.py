@@ -24,6 +24,7 @@ ASIDE = np.radians(25.0)  # largest angle between x and the direction of motion,
 LEVEL = 0.9  # cosine of the largest tilt of a vehicle in a world with z up
 VEHICLE_AXES = ("flu", "frd", "rfu")
 OTHER_AXES = [axes for axes in ALL_AXES if axes not in VEHICLE_AXES and not is_left_handed(axes)] + list(LEFT_HANDED)
+MOST_ROWS = 100_000  # of a file of which unusual readings are made: each takes as much memory as the poses
 OPPOSITE = dict(zip("fblrud", "bfrldu", strict=True))
 
 
@@ -55,9 +56,10 @@ def of_bodies(
         made: dict[tuple[bool, str], tuple[Array, Array]] = {}  # which all cameras share
         for body, axes in ((body, axes) for body, each in axes_of.items() for axes in each):
             states = {"pose_angles": angles, "pose_transform": transform, "pose_axes": axes, "poses_of": body}
-            if not wanted.items() <= states.items():
-                continue
             is_vehicle = body == "vehicle"
+            rank = int(axes not in (VEHICLE_AXES if is_vehicle else ("rdf",)) and "pose_axes" not in wanted)
+            if not wanted.items() <= states.items() or (rank and len(at) > MOST_ROWS):
+                continue
             known = None if is_vehicle else cameras[body]
             if is_vehicle or known is not None:
                 few = _with_axes(at[rows], quaternions[rows], axes, is_vehicle=is_vehicle)
@@ -65,7 +67,6 @@ def of_bodies(
                     continue
             if (is_vehicle, axes) not in made:
                 made[is_vehicle, axes] = _with_axes(at, quaternions, axes, is_vehicle=is_vehicle)
-            rank = int(axes not in (VEHICLE_AXES if is_vehicle else ("rdf",)) and "pose_axes" not in wanted)
             yield PoseReading(states, *made[is_vehicle, axes], camera="" if is_vehicle else body, rank=rank)
 
 
