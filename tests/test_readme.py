@@ -31,6 +31,7 @@ def test_the_commands_run(clone: Path, first: bool) -> None:
             assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.slow
 def test_the_python_example_writes_a_recording(clone: Path) -> None:
     [example] = blocks("python")
     with contextlib.chdir(clone):

@@ -57,6 +57,7 @@ def result(street, matched):
         return bevcli.calibrate(DriveView(drive, rig=wrong))
 
 
+@pytest.mark.slow
 def test_a_planted_rotation_is_found(street, result):
     _, right, wrong = street
     assert angle_deg(right, wrong, TURNED) > 2
@@ -66,11 +67,13 @@ def test_a_planted_rotation_is_found(street, result):
     assert pitch == pytest.approx(1.0, abs=0.3)  # and up
 
 
+@pytest.mark.slow
 def test_a_planted_height_is_found(result):
     assert result[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
     assert result[LOW].verdict is Verdict.CORRECTED
 
 
+@pytest.mark.slow
 def test_errors_are_within_four_standard_deviations(street, result):
     _, right, _ = street
     for name in (TURNED, LOW):
@@ -100,17 +103,20 @@ def test_lens_distortion_is_respected(street, lens, zoom):
     assert found[LOW].position_m[2] == pytest.approx(0.15, abs=0.03)
 
 
+@pytest.mark.slow
 def test_no_point_is_matched_twice(result, matched):
     [found] = matched
     points = np.column_stack([found.group, found.rays_a])
     assert len(np.unique(points, axis=0)) == len(points) > 1000
 
 
+@pytest.mark.slow
 def test_the_residual_falls_to_less_than_a_pixel(result):
     assert result[TURNED].before_px > 3 * result[TURNED].after_px
     assert result[TURNED].after_px < 1
 
 
+@pytest.mark.slow
 def test_the_files_give_the_corrected_rig_back(result, tmp_path):
     result.write(tmp_path)
     reread = read_calibration(tmp_path / "calibration.json")
@@ -200,6 +206,7 @@ def test_a_folder_without_ego_motion_is_refused(tmp_path):
     assert "has no ego-motion" in str(done.exception)
 
 
+@pytest.mark.slow
 def test_a_corrected_drive_has_the_corrected_rig_in_its_frames(street, result):
     drive = DriveView(DriveView(street[0], rig=street[2]), rig=result.rig)
     assert drive.rig is result.rig
@@ -228,6 +235,7 @@ def undecided(estimate, *, correlation):
     return replace(estimate, verdict=Verdict.CORRECTED, change=change, covariance=covariance, delay_deviation_ms=60.0)
 
 
+@pytest.mark.slow
 def test_a_time_offset_or_a_rotation_is_one_of_both(result):
     text = either_text(undecided(result[TURNED], correlation=0.99))
     assert text.startswith(f"the images of {TURNED} were taken 119 ms later than stated, or it is turned by 1.0°")
@@ -238,6 +246,7 @@ def turned_by(rig, yaw_deg):
     return wrong_rig(rig, TURNED, (0, yaw_deg, 0), (0, 0, 0))
 
 
+@pytest.mark.slow
 def test_motion_and_calibration_are_measured_until_both_stand(result, street, monkeypatch):
     """Each round leaves half of the error of the rig that the motion was measured with."""
     left_deg = [0.12]
@@ -281,6 +290,7 @@ def delayed(estimate, delay_ms, deviation_ms=4.0):
     return replace(estimate, delay_ms=delay_ms, delay_deviation_ms=deviation_ms)
 
 
+@pytest.mark.slow
 def test_a_delay_of_all_cameras_may_be_one_of_the_poses(result):
     both = [delayed(result[TURNED], 17.0), delayed(result[LOW], 21.0)]
     text = common_delay_text(both, 103.7)
@@ -293,6 +303,7 @@ def test_a_delay_of_all_cameras_may_be_one_of_the_poses(result):
     assert (finding.code, finding.camera) == ("capture-times-off", None)
 
 
+@pytest.mark.slow
 def test_a_delay_of_one_camera_is_not_one_of_the_poses(result):
     assert not common_delay_text([delayed(result[TURNED], 80.0), delayed(result[LOW], 1.0)], None)
     assert not common_delay_text([delayed(result[TURNED], 80.0), delayed(result[LOW], 0.0, 60.0)], None)

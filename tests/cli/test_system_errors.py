@@ -95,6 +95,7 @@ def test_weights_on_a_full_disk_are_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_numba_without_its_compiler_is_one_line():
     code = "import bevcli.model.kernels.loops"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}

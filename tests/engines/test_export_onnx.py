@@ -60,6 +60,7 @@ def demo_file(tmp_path_factory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_a_deformable_convolution_is_an_operator_of_a_file(tmp_path):
     network, x = (
         torch.nn.Sequential(*(ModulatedDeformableConvolution(3, 3, stride) for stride in (1, 2))),

@@ -26,7 +26,7 @@ def street():
     return open_sequence(STREET, every=2, frames=slice(0, 3), ground_truth=False)
 
 
-FAST = ("lidar of nuScenes", "KITTI's rows of a vehicle")
+FAST = ("lidar of nuScenes",)
 
 
 @pytest.mark.parametrize(
