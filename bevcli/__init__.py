@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
     from bevcli.inference.load import Model as Model, load_model as load_model
-    from bevcli.inference.run import Session as Session, run as run
+    from bevcli.inference.run import run as run
     from bevcli.recording import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.formats.export import export as export
     from bevcli.workshop.hub import pack_model as pack_model
+    from bevcli.workshop.live import Session as Session
     from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare
     from bevcli.workshop.scores.evaluate import evaluate as evaluate

@@ -1,6 +1,6 @@
 """The types that pass between the parts: a frame as readers return it, and a prediction as the model returns it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
@@ -113,7 +113,7 @@ class FrameResult:
     Attributes:
         kind: last part of its entities in a recording, such as "map_lines".
         file_name: of its file in the folder of a run.
-        writer: makes the `GrowingFile` of a path, with `frame_of_reference` ("world" or "ego"), `extras` (facts of the
+        writer: kind of `GrowingFile`, made of a path, `frame_of_reference` ("world" or "ego"), `extras` (facts of the
             run, "classes" with the names among them) and `resume_at`. Its method `write(ground, result)` adds a frame;
             the result is None where the model was not run.
         takes_command: its names are commands of the driver, see `with_command`.
@@ -123,7 +123,7 @@ class FrameResult:
 
     kind: ClassVar[str]
     file_name: ClassVar[str]
-    writer: ClassVar[Callable[..., Any]]
+    writer: ClassVar[type[Any]]
     takes_command: ClassVar[bool] = False
     true_file: ClassVar[str] = ""
     true_names: ClassVar[tuple[str, ...]] = ()

@@ -4,8 +4,6 @@ Fog is recognised, and its light taken away, as by a dark channel (He et al. 200
 are moved into the ranges that ordinary images have. Noise is measured, and smoothed by OpenCV's filters.
 """
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +39,11 @@ MEASURED_ROWS = 12
 
 def repaired(pixels_bgr: Pixels, image: ImageConfig) -> Pixels:
     """(H, W, 3) without fog, with ordinary grey levels and without strong noise, as far as the model asks for it."""
-    levels = auto_levels if image.auto_levels else np.asarray
     pixels_bgr = defogged(pixels_bgr) if image.defog else pixels_bgr
     if not image.denoise:
-        return levels(pixels_bgr)
+        return auto_levels(pixels_bgr) if image.auto_levels else pixels_bgr
     height, width = pixels_bgr.shape[:2]
-    return denoised(pixels_bgr, min(image.size[0] / width, image.size[1] / height), levels)
+    return denoised(pixels_bgr, min(image.size[0] / width, image.size[1] / height), auto=image.auto_levels)
 
 
 def defogged(pixels_bgr: Pixels) -> Pixels:
@@ -107,7 +104,7 @@ def grey_levels(pixels_bgr: Pixels, shares: tuple[float, ...]) -> tuple[int, ...
     return tuple(int(level) for level in np.searchsorted(below, shares))
 
 
-def denoised(pixels_bgr: Pixels, scale: float, levels: Callable[[Pixels], Pixels]) -> Pixels:
+def denoised(pixels_bgr: Pixels, scale: float, *, auto: bool = False) -> Pixels:
     """The image with other grey levels and without strong noise; with other grey levels only where it has little noise.
 
     Single wrong pixels are removed by a median filter. Other noise is blurred by a Gaussian as wide as the noise is
@@ -117,8 +114,9 @@ def denoised(pixels_bgr: Pixels, scale: float, levels: Callable[[Pixels], Pixels
         pixels_bgr: (H, W, 3).
         scale: pixels of the network's input per pixel of the image. Where that is smaller, resizing averages the noise,
             and a noisy image is returned in its size.
-        levels: gives an image ordinary grey levels, which makes the noise of a dark one stronger.
+        auto: the image also gets ordinary grey levels, which makes the noise of a dark one stronger.
     """
+    levels = auto_levels if auto else np.asarray
     levelled, scale = levels(pixels_bgr), min(scale, 1.0)
     noise = measure_noise(levelled) * scale
     if noise < NOISY:

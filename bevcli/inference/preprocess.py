@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from operator import index
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -308,16 +307,6 @@ def check_cameras(by_camera: Mapping[str, object], rig: CameraRig, argument: str
     for name in by_camera:
         if name not in rig.names:
             raise InputError(f"`{argument}`: camera {name} is not in the rig (it has {', '.join(rig.names)})")
-
-
-def whole_nanoseconds(timestamp_ns: Any) -> int:
-    """A time as an integer. Raises InputError for any other type, such as seconds as a float."""
-    try:
-        return index(timestamp_ns)
-    except TypeError:
-        found = f"{type(timestamp_ns).__name__} {timestamp_ns!r:.40}"
-        advice = "pass round(seconds * 1e9)" if isinstance(timestamp_ns, float | np.floating) else "pass an int"
-        raise InputError(f"`timestamp_ns`: expected whole nanoseconds (found {found}): {advice}") from None
 
 
 def _check_image(pixels: NDArray[Any], camera: Camera) -> None:

@@ -2,9 +2,9 @@
 
 check_calibration    reads a calibration or a sequence, runs all checks, also of times; the result as text and files
 coverage             the BEV cells that cameras see, and the rig next to nuScenes'
-sequence_checks      all checks of a sequence: the rig in their order, and ego-motion; those before a run
+sequence_checks      all checks of a sequence: the rig in their order, and ego-motion; those before a run;
+                     units, inverted transforms, quaternion order, axes: explanations of implausible poses
 rig_checks           mounting, names and lenses of cameras; the bev frame
-mistakes             units, inverted transforms, quaternion order, axes: explanations of implausible poses
 drawings             cameras.png, coverage.png and recording.rrd
 """
 

@@ -1,7 +1,7 @@
 """The checks of a rig, one by one: mounting and names of the cameras, their lenses, and the bev frame.
 
 A name such as CAM_BACK_LEFT states a viewing direction. Published weights expect nuScenes' LIDAR_TOP as bev frame: x
-right, y forward, 1.84 m above the ground. `sequence_checks` runs the checks; `mistakes` explains implausible poses.
+right, y forward, 1.84 m above the ground. `sequence_checks` runs the checks, and explains implausible poses.
 """
 
 import re

@@ -19,7 +19,7 @@ from bevcli.frame import CameraImage, FrameResult, FrameStamp, Ground, GroundLin
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference.load import Model
-from bevcli.inference.run import Session, run
+from bevcli.inference.run import run
 from bevcli.inference.runner import read_commands, with_command
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
@@ -33,6 +33,7 @@ from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines, read_lines
+from bevcli.workshop.live import Session
 from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
 from bevcli.workshop.vad.plan import Plan, read_plans
 from bevcli.workshop.vad.vad import VAD, VADConfig

@@ -11,9 +11,9 @@ import pytest
 from small_drive import CAMERAS, SIZE, image_of
 
 from bevcli.errors import InputError
+from bevcli.sequences.images import VideoReader
 from bevcli.sequences.native import holds_videos_alone
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.videos import VideoReader
 from bevcli.workshop.formats.video_file import container_times_ns
 
 

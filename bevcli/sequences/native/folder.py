@@ -22,10 +22,9 @@ from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded,
 from bevcli.sequences.files.incremental_json import existing
 from bevcli.sequences.files.map_folder import open_maps
 from bevcli.sequences.format import TrueResult
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
+from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out, rotation_notes
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.options import EgoMotionUse, InputOptions, RigOptions
-from bevcli.sequences.videos import rotation_notes
 
 BOXES_FILE = "ground_truth.json"
 MAPS_FOLDER = "ground_truth_map"

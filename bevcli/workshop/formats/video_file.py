@@ -20,11 +20,18 @@ from bevcli.parsing.files import MIB, open_regular
 from bevcli.printing import counted
 from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
-from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes
+from bevcli.sequences.images import (
+    FrameEntry,
+    ImageSource,
+    ListedDrive,
+    bev_frame_notes,
+    count_and_rate,
+    open_capture,
+    rotation_notes,
+)
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.native.folder import check_covered, decided
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.videos import count_and_rate, open_capture, rotation_notes
 from bevcli.workshop.formats.calibrations import SEVERAL
 from bevcli.workshop.formats.matching import CameraImages, covered
 

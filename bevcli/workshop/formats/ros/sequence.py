@@ -26,9 +26,9 @@ from bevcli.printing import one_line
 from bevcli.sequences import images
 from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_of, draft_rig
 from bevcli.sequences.files.ego_motion_file import DrivePoses, ReadPoses, read_poses
+from bevcli.sequences.images import MOST_PIXELS, VideoReader
 from bevcli.sequences.native.folder import decided
 from bevcli.sequences.options import InputOptions
-from bevcli.sequences.videos import MOST_PIXELS, VideoReader
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.matching import CameraImages, frames_at
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import lz4.frame  # type: ignore[import-not-found,import-untyped,unused-ignore]
@@ -352,7 +351,7 @@ def _cdr(topic: Topic) -> Decode:
 
 def _json(topic: Topic) -> Decode:
     # Objects with attributes in place of dicts.
-    return lambda data: parse_json(data, Path(topic.name), made=lambda fields: SimpleNamespace(**fields))
+    return lambda data: parse_json(data, Path(topic.name), namespaces=True)
 
 
 def _protobuf(topic: Topic) -> Decode:
