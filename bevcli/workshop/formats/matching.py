@@ -20,8 +20,7 @@ from bevcli.parsing.documents import CSV_BYTES
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text
 from bevcli.parsing.images import size_of_image
 from bevcli.printing import counted, name_of
-from bevcli.sequences.images import FrameEntry, Source
-from bevcli.sequences.videos import size_of_video
+from bevcli.sequences.images import FrameEntry, Source, size_of_video
 from bevcli.workshop.formats.camera_names import folder_of_images, match_names
 
 FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
