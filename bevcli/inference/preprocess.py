@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,8 +20,10 @@ from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.road_slopes import GreyView
 from bevcli.model.step import CameraAssignment, PreparedFrame, assign_cameras
 
+GREY_WIDTH = 512  # pixels of the images in which points are followed
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
 
@@ -79,9 +82,13 @@ class Preprocessor:
             empty[:] = self.config.image.pad_bgr
         images = torch.from_numpy(empty).movedim(-1, 2)
 
+        greys = dict.fromkeys(names, np.zeros((0, 0), np.uint8)) if self.config.levels else {}
+
         def write(camera: int, name: str) -> None:
-            pixels = repaired(frame.rig[name].undistort(frame.images[name].pixels_bgr), image)
-            self._write(pixels, image, images[0, camera].numpy())
+            pixels = frame.rig[name].undistort(frame.images[name].pixels_bgr)
+            if greys:
+                greys[name] = small_grey(pixels, image)
+            self._write(repaired(pixels, image), image, images[0, camera].numpy())
 
         present = [(camera, name) for camera, name in enumerate(names) if name in frame.images]
         if self._threads is None:
@@ -101,6 +108,7 @@ class Preprocessor:
             camera_index=torch.tensor([self.config.cameras.index(name) for name in assignment.embeddings]),
             has_image=torch.tensor([[name in frame.images for name in names]]),
             pixels=self.pixels,
+            grey=grey_view(frame, greys) if greys else None,
         )
 
 
@@ -159,6 +167,30 @@ def network_from_image(camera: Camera, image: ImageConfig) -> Array:
 def resize_shift(scale: float, image: ImageConfig) -> float:
     """Pixels of the resized image that are added to scaled pixel coordinates: see `ImageConfig.half_pixel_shift`."""
     return (scale - 1) / 2 if image.half_pixel_shift else 0.0
+
+
+def small_grey(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.uint8]:
+    """An undistorted image (H, W, 3) in grey, (h, w), at most as large as the network's."""
+    height, width = pixels_bgr.shape[:2]
+    scale = min(image.size[0] / width, image.size[1] / height) * min(GREY_WIDTH / image.size[0], 1.0)
+    size = max(round(scale * width), 1), max(round(scale * height), 1)
+    grey = cv2.cvtColor(pixels_bgr, cv2.COLOR_BGR2GRAY)
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def grey_view(frame: Frame, greys: Mapping[str, NDArray[np.uint8]]) -> GreyView:
+    """Images of `small_grey` by camera, empty where there is none, in the frame's bev frame."""
+    largest = np.max([grey.shape for grey in greys.values()], axis=0)
+    images, projections = np.zeros((len(greys), *largest), np.uint8), []
+    for together, (name, grey) in zip(images, greys.items(), strict=True):
+        together[: grey.shape[0], : grey.shape[1]] = grey
+        camera = frame.rig[name]
+        scale = np.array([grey.shape[1] / camera.width, grey.shape[0] / camera.height]) if grey.size else np.ones(2)
+        grey_from_image = np.diag([*scale, 1.0, 1.0])
+        grey_from_image[:2, 2] = (scale - 1) / 2
+        projections.append(grey_from_image @ image_from_bev(frame, name))
+    arrays = images, np.stack(projections), frame.rig.ego_from_bev
+    return GreyView(*map(torch.from_numpy, arrays))
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:

@@ -285,6 +285,11 @@ class ModelConfig:
         return () if self.detector is None else IMAGE_CLASSES
 
     @property
+    def levels(self) -> bool:
+        """Whether the model levels the rig of each frame by the boxes in the images."""
+        return self.image_detector is not None and self.hybrid_queries.count > 0 and self.hybrid_queries.level
+
+    @property
     def detector(self) -> NanoDetConfig | None:
         """What tells the boxes in the images: the detector beside the backbone, or the backbone where it is one."""
         return self.backbone if isinstance(self.backbone, NanoDetConfig) else self.image_detector

@@ -17,7 +17,8 @@ from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, bra
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 from bevcli.model.pillar_projection import project_points
-from bevcli.model.upload import upload
+from bevcli.model.road_slopes import RoadSlopes
+from bevcli.model.upload import upload_together
 
 GROUP_COUNT = 4
 # Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
@@ -95,7 +96,14 @@ class HybridQueries(nn.Module):
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
         self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
 
-    def forward(self, bev: Tensor, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self,
+        bev: Tensor,
+        boxes: ImageBoxes,
+        image_from_bev: Tensor,
+        sizes: Tensor,
+        slopes: RoadSlopes | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """Class logits (B, H, classes) and box codes (B, H, 10) of the hybrid queries.
 
         Args:
@@ -103,9 +111,10 @@ class HybridQueries(nn.Module):
             boxes: of N cameras.
             image_from_bev: (B, N, 4, 4), bev metres to pixels of the network's input.
             sizes: (B, N, 2) width and height of the images within their padding, pixels.
+            slopes: of the road that were expected, see `Lift`.
         """
         with torch.no_grad():
-            logits, codes, *_ = self.lift(boxes, image_from_bev, sizes)
+            logits, codes, _ = self.lift(boxes, image_from_bev, sizes, slopes)
             place = (codes[..., :2] - self.range_start) / self.range_extent
             is_inside = ((place > 0) & (place < 1)).all(-1, keepdim=True)
             logits = logits.where(is_inside, NO_BOX)
@@ -126,25 +135,29 @@ class HybridQueries(nn.Module):
         return logits + self.class_correction(query), codes + self.box_correction(query)
 
     @torch.no_grad()
-    def levelled(self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor) -> Tensor:
-        """(B, N, 4, 4), on the CPU where image_from_bev is: pixels from a bev frame that is level with the road.
+    def levelled(
+        self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor, expected: RoadSlopes | None = None
+    ) -> tuple[Tensor, RoadSlopes]:
+        """(B, N, 4, 4), pixels from a bev frame that is level with the road, and the slopes of the road; on the CPU.
 
         It is turned about the point of the road below its origin, and the less, the less sure the slope is. Arguments:
-        see `forward`.
+        see `forward`; all but the boxes are on the CPU.
         """
-        device = boxes.boxes.device
-        *_, slopes, covariance = self.lift(boxes, upload(image_from_bev, device), upload(sizes, device))
+        cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
+        told = self.lift(boxes, *cameras)[-1]
+        told = RoadSlopes(*(x.to(image_from_bev.device) for x in (told.mean, told.covariance)))
+        slopes, covariance = told.mean, told.covariance
         (xx, xy), (_, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
         x, y = slopes.unbind(-1)
         sureness = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)  # in squares of standard deviations
-        slopes = (slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]).to(image_from_bev.device)
+        slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
         one, zero = torch.ones_like(slopes[:, :1]), torch.zeros_like(slopes[:, :1])
         forward, up = torch.cat([one, zero, slopes[:, :1]], -1), torch.cat([-slopes, one], -1)
         x, z = F.normalize(forward, dim=-1), F.normalize(up, dim=-1)
         bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
         bev_from_level[:, :3, :3] = torch.stack([x, torch.linalg.cross(z, x), z], -1)
         bev_from_level[:, :3, 3] = self.lift.ground_z * (zero.new_tensor([0.0, 0.0, 1.0]) - z)
-        return image_from_bev @ bev_from_level[:, None]
+        return image_from_bev @ bev_from_level[:, None], told
 
     def weighed(
         self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]

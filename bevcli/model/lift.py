@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
+from bevcli.model.road_slopes import SPREAD, RoadSlopes
 
 NAMES = {"person": "pedestrian"}  # names of classes that are other ones in images
 # Of each image class: mean width, length and height of its objects, metres.
@@ -22,7 +23,6 @@ SIZES_WLH = (
 UNKNOWN = -5.0  # logit of a class that the detector does not have, before what is learned
 NO_BOX = -20.0  # logit of all classes where there is no box
 NEAREST_M, FARTHEST_M = 1.0, 100.0
-TILT_SPREAD = 0.016  # standard deviation of the slope of the ground relative to a vehicle, along x and along y
 OF_IMAGE, OF_RAYS = 8 + len(IMAGE_CLASSES), 15  # numbers that the network is told of a box
 
 
@@ -71,18 +71,18 @@ class Lift(nn.Module):
                 nn.init.zeros_(weights)
 
     def forward(
-        self, found: ImageBoxes, image_from_bev: Tensor, sizes: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Class logits (B, N · K, classes), box codes (B, N · K, 10), slopes of the ground (B, 2), their covariance.
+        self, found: ImageBoxes, image_from_bev: Tensor, sizes: Tensor, slopes: RoadSlopes | None = None
+    ) -> tuple[Tensor, Tensor, RoadSlopes]:
+        """Class logits (B, N · K, classes), box codes (B, N · K, 10), and the slopes of the road that the boxes tell.
 
-        The slopes are those along x and y, their covariance is (B, 2, 2). The codes are those of `decoder.encode`, in
-        the level bev frame of the vehicle; velocities are 0. A box that stands there once for each of several classes
-        counts once.
+        The codes are those of `decoder.encode`, in the level bev frame of the vehicle; velocities are 0. A box that
+        stands there once for each of several classes counts once.
 
         Args:
             found: boxes in pixels of the network's input.
             image_from_bev: (B, N, 4, 4), pixels of the network's input.
             sizes: (B, N, 2) width and height of the images in the network's input, without padding, pixels.
+            slopes: that were expected; None where nothing is known.
         """
         logits = found.logits.float()
         is_box = (found.scores > 0) & (found.labels == logits.argmax(-1))  # (B, N, K)
@@ -97,10 +97,12 @@ class Lift(nn.Module):
         aspect = (rays.chord / rays.rise).clamp(0.1, 10.0).log()
         of_image = [(room / 8).clamp(max=1), extent.log() - 4, aspect[..., None], hidden_feet(boxes, scores)[..., None]]
         seen = torch.cat([*of_image, logits / 3], -1)
-        slopes, covariance = self._slopes(seen, scores, rays, distances)
+        slopes = self._slopes(seen, scores, rays, distances, slopes)
         along = rays.bearing
-        tilt = (along * slopes[:, None, None]).sum(-1)
-        doubt = ((along[..., None, :] * covariance[:, None, None]).sum(-1) * along).sum(-1)  # the variance of the tilt
+        tilt = (along * slopes.mean[:, None, None]).sum(-1)
+        doubt = ((along[..., None, :] * slopes.covariance[:, None, None]).sum(-1) * along).sum(
+            -1
+        )  # the variance of the tilt
         level = rays.distances(mean, tilt)
         steps = [x[..., :1] - x[..., 1:2] for x in (distances, level)]
         features = [] if self.reduce is None else [self.reduce(self.dropout(found.features.float()))]
@@ -122,26 +124,35 @@ class Lift(nn.Module):
         codes = [x, y, size[..., 0], size[..., 1], z, size[..., 2], -cos, -sin, 0 * x, 0 * x]
         class_logits = self.class_scale * (logits @ self.known.T) + (1 - self.known.sum(-1)) * UNKNOWN + correction
         class_logits = torch.where(is_box[..., None], class_logits, NO_BOX)
-        return class_logits.flatten(1, 2), torch.stack(codes, -1).flatten(1, 2), slopes, covariance
+        return class_logits.flatten(1, 2), torch.stack(codes, -1).flatten(1, 2), slopes
 
-    def _slopes(self, seen: Tensor, scores: Tensor, rays: "Rays", distances: Tensor) -> tuple[Tensor, Tensor]:
-        """The slopes (B, 2) of the ground along x and y that fit all boxes best, and their covariance (B, 2, 2).
+    def _slopes(
+        self, seen: Tensor, scores: Tensor, rays: "Rays", distances: Tensor, expected: RoadSlopes | None
+    ) -> RoadSlopes:
+        """The slopes that fit all boxes and what was expected best.
 
         The network states of each box the logarithms of its true to its measured distance, and of its precision.
         """
         ratio, precision = self.tilt(seen).unbind(-1)
-        expected = rays.height.clamp(min=0.3) * (0.15 + ratio - distances[..., 1]).clamp(-6, 2).exp()
-        stated = (rays.foot_slope + expected).clamp(-0.1, 0.1)
-        weights = scores * (4 + precision).clamp(max=8).exp() / (expected.square() + 1e-4)
+        drop = rays.height.clamp(min=0.3) * (0.15 + ratio - distances[..., 1]).clamp(-6, 2).exp()
+        stated = (rays.foot_slope + drop).clamp(-0.1, 0.1)
+        weights = scores * (4 + precision).clamp(max=8).exp() / (drop.square() + 1e-4)
         weighted = (rays.bearing * weights[..., None]).flatten(1, 2)  # (B, N · K, 2)
-        x, y = (weighted * stated.flatten(1, 2)[..., None]).sum(1).unbind(-1)
-        products = weighted[..., None] * rays.bearing.flatten(1, 2)[..., None, :]
-        # Without a box, slopes are small.
-        (xx, xy), (_, yy) = (row.unbind(-1) for row in products.sum(1).unbind(-2))
-        xx, yy = xx + TILT_SPREAD**-2, yy + TILT_SPREAD**-2
-        inverse = torch.stack([yy, -xy, -xy, xx], -1) / (xx * yy - xy * xy)[:, None]
-        covariance = inverse.unflatten(-1, (2, 2))
-        return (covariance * torch.stack([x, y], -1)[:, None]).sum(-1), covariance
+        pull = (weighted * stated.flatten(1, 2)[..., None]).sum(1)
+        products = (weighted[..., None] * rays.bearing.flatten(1, 2)[..., None, :]).sum(1)
+        if expected is None:
+            products = products + torch.eye(2, device=products.device) * SPREAD**-2
+        else:
+            information = inverse_of_two(expected.covariance)
+            products, pull = products + information, pull + (information * expected.mean[:, None]).sum(-1)
+        covariance = inverse_of_two(products)
+        return RoadSlopes((covariance * pull[:, None]).sum(-1), covariance)
+
+
+def inverse_of_two(matrices: Tensor) -> Tensor:
+    """Of symmetric matrices (..., 2, 2), by operations that exported files have."""
+    (xx, xy), (_, yy) = (row.unbind(-1) for row in matrices.unbind(-2))
+    return torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2)) / (xx * yy - xy * xy)[..., None, None]
 
 
 class Rays:

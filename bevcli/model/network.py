@@ -18,6 +18,7 @@ from bevcli.model.hybrid_queries import HybridQueries
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
+from bevcli.model.road_slopes import RoadSlopes
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
@@ -82,18 +83,25 @@ class Network(TemporalModel):
         return self.image_detector.image_boxes(self.image_detector(images.flatten(0, 1)), has_image, image_sizes)
 
     def look(
-        self, images: Tensor, has_image: Tensor, image_from_bev: Tensor, image_sizes: Tensor
-    ) -> tuple[ImageBoxes | None, Tensor]:
-        """The boxes of the detector beside the backbone, None without one; and the rig as they level it.
+        self,
+        images: Tensor,
+        has_image: Tensor,
+        image_from_bev: Tensor,
+        image_sizes: Tensor,
+        expected: RoadSlopes | None = None,
+    ) -> tuple[ImageBoxes | None, Tensor, RoadSlopes | None]:
+        """The boxes of the detector beside the backbone, None without one; the rig as they level it; the road's slopes.
 
-        The rig is image_from_bev itself where the model does not level it. Arguments: see `ModelInputs`.
+        The rig is image_from_bev itself, the slopes None, where the model does not level it.
+
+        expected: slopes, see `expected_slopes`. Others: see `ModelInputs`.
         """
         if self.image_detector is None:
-            return None, image_from_bev
+            return None, image_from_bev, None
         boxes = self.find_image_boxes(images, has_image, image_sizes)
         if self.hybrid_queries is None or not self.config.hybrid_queries.level:
-            return boxes, image_from_bev
-        return boxes, self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes)
+            return boxes, image_from_bev, None
+        return boxes, *self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes, expected)
 
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""
@@ -116,15 +124,19 @@ class Network(TemporalModel):
         image_from_bev: Tensor,
         image_from_level: Tensor,
         image_sizes: Tensor,
+        expected: RoadSlopes | None = None,
     ) -> ModelOutputs:
         """As `detect`, with the boxes in the images, and the queries that start from them, where the model has these.
 
         image_from_bev, image_sizes: see `ModelInputs`. image_from_level: as image_from_bev, of the rig that made `bev`.
+        expected: see `look`.
         """
         outputs = self.detect(bev)
         if self.hybrid_queries is not None and boxes is not None:
             with without_autocast(bev.device):
-                hybrid_logits, hybrid_codes = self.hybrid_queries(bev.float(), boxes, image_from_bev, image_sizes)
+                hybrid_logits, hybrid_codes = self.hybrid_queries(
+                    bev.float(), boxes, image_from_bev, image_sizes, expected
+                )
                 learned = outputs.class_logits, outputs.box_codes
                 cameras = image_from_level, image_sizes
                 logits, hybrid_logits = self.hybrid_queries.weighed(learned, hybrid_logits, boxes, cameras)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
 from bevcli.model.image_boxes import ImageBoxes
+from bevcli.model.road_slopes import GreyView, RoadSlopes
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
 
@@ -49,6 +50,7 @@ class PreparedFrame:
         camera_index: (N,) int64, index of each camera's embedding.
         has_image: (1, N) bool.
         pixels: the images are as an exported file takes them, which normalises them itself.
+        grey: the images once more, for a model that levels the rig of each frame.
     """
 
     frame: Frame
@@ -59,6 +61,7 @@ class PreparedFrame:
     camera_index: Tensor
     has_image: Tensor
     pixels: bool = False
+    grey: GreyView | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,7 @@ class ModelInputs:
         can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
         shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
         rotation_deg: (B,) float32, rotation of the history map.
+        expected_slopes: of the road, before the boxes of the frame are looked at; None where nothing is known.
     """
 
     images: Tensor
@@ -84,6 +88,7 @@ class ModelInputs:
     can_bus: Tensor
     shift: Tensor
     rotation_deg: Tensor
+    expected_slopes: RoadSlopes | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -91,10 +96,11 @@ class ModelInputs:
         return self.images.shape[-2], self.images.shape[-1]
 
     def to(self, device: torch.device) -> "ModelInputs":
-        """The same inputs on a device, but for what is read on the CPU: image_from_bev, has_image and rotation_deg."""
-        kept = ("image_from_bev", "has_image", "rotation_deg")
-        tensors = {field.name: getattr(self, field.name) for field in fields(self)}
-        return ModelInputs(**{name: x if name in kept else upload(x, device) for name, x in tensors.items()})
+        """The same inputs on a device, but for what is read on the CPU."""
+        kept = ("image_from_bev", "has_image", "rotation_deg", "expected_slopes")
+        names = [field.name for field in fields(self) if field.name not in kept]
+        moved: dict[str, Any] = {name: upload(getattr(self, name), device) for name in names}
+        return replace(self, **moved)
 
 
 class Clip(Protocol):
@@ -124,6 +130,7 @@ class ModelOutputs:
         box_codes: (L, B, Q, 10): cx, cy, log w, log l, cz, log h, sin, cos, vx, vy; centres in metres, bev frame.
         segmentation: outputs of the segmentation head, None without one.
         image_boxes: boxes in the images, None where the backbone is no detector.
+        road_slopes: on the CPU, None of a model that does not level the rig.
     """
 
     stay_on_device: ClassVar[tuple[str, ...]] = ("bev",)
@@ -133,6 +140,7 @@ class ModelOutputs:
     box_codes: Tensor
     segmentation: SegmentationOutputs | None = None
     image_boxes: ImageBoxes | None = None
+    road_slopes: RoadSlopes | None = None
 
     @property
     def by_name(self) -> dict[str, Tensor]:
@@ -141,6 +149,8 @@ class ModelOutputs:
         if self.segmentation is not None:
             named["mask_logits"] = self.segmentation.mask_logits[-1]
             named["mask_class_logits"] = self.segmentation.class_logits[-1]
+        if self.road_slopes is not None:
+            named |= {"road_slopes": self.road_slopes.mean, "road_covariance": self.road_slopes.covariance}
         return named
 
     @classmethod
@@ -151,7 +161,8 @@ class ModelOutputs:
             masks, classes = tensors["mask_logits"][None], tensors["mask_class_logits"][None]
             segmentation = SegmentationOutputs(masks, classes, locations=torch.zeros(0, 1, 0, 4))
         logits, codes = tensors["class_logits"][None], tensors["box_codes"][None]
-        return cls(tensors["bev"], logits, codes, segmentation, ImageBoxes.of_names(tensors))
+        slopes = RoadSlopes.of_names(tensors)
+        return cls(tensors["bev"], logits, codes, segmentation, ImageBoxes.of_names(tensors), slopes)
 
     @classmethod
     def ports(cls, config: ModelConfig) -> Iterator[tuple[str, tuple[int, ...], str]]:
@@ -181,6 +192,9 @@ class ModelOutputs:
                 (1, masks),
                 "(1, Q): that the object exists. A cell's probability is sigmoid(mask) * sigmoid(class).",
             )
+        if config.levels:
+            yield "road_slopes", (1, 2), "(1, 2): of the road along x and y of the bev frame."
+            yield "road_covariance", (1, 2, 2), "(1, 2, 2): of road_slopes."
 
     def boxes(self, config: ModelConfig) -> Boxes3D:
         """The boxes with the best scores of the last decoder layer, by falling score, bev frame; of a batch of one.
@@ -207,7 +221,7 @@ class ModelOutputs:
         """The outputs of the last layers, all that results are decoded from."""
         segmentation = None if self.segmentation is None else self.segmentation.last_layers()
         logits, codes = self.class_logits[-1:], self.box_codes[-1:]
-        return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation)
+        return replace(self, class_logits=logits, box_codes=codes, segmentation=segmentation, road_slopes=None)
 
 
 def model_inputs(prepared: PreparedFrame, previous_pose: Pose | None, config: ModelConfig) -> ModelInputs:
@@ -241,21 +255,24 @@ def _image_sizes(prepared: PreparedFrame, config: ModelConfig) -> Tensor:
 
 
 def joined_inputs(parts: Sequence[ModelInputs]) -> ModelInputs:
-    """The inputs of several batches as one batch. Raises InputError where they have different numbers of cameras."""
+    """The inputs of several batches as one batch, without slopes that were expected.
+
+    Raises InputError where they have different numbers of cameras.
+    """
     counts = sorted({part.has_image.shape[1] for part in parts})
     if len(counts) > 1:
         raise InputError(
             f"{counts[0]} and {counts[-1]} cameras cannot go into one batch: use sequences with the same number of "
             "cameras, or batches of 1"
         )
-    tensors = {field.name: [getattr(part, field.name) for part in parts] for field in fields(ModelInputs)}
+    names = [field.name for field in fields(ModelInputs) if field.name != "expected_slopes"]
+    tensors = {name: [getattr(part, name) for part in parts] for name in names}
     images, indices = tensors.pop("images"), tensors.pop("camera_index")
     same = all(torch.equal(index, indices[0]) for index in indices)
     rows = [index.expand(len(part.has_image), -1) for index, part in zip(indices, parts, strict=True)]
     index = indices[0] if same and indices[0].ndim == 1 else torch.cat(rows)
-    return ModelInputs(
-        images=_together(images), camera_index=index, **{name: torch.cat(values) for name, values in tensors.items()}
-    )
+    joined: dict[str, Any] = {name: torch.cat(values) for name, values in tensors.items()}
+    return ModelInputs(images=_together(images), camera_index=index, **joined)
 
 
 def _together(images: list[Tensor]) -> Tensor:

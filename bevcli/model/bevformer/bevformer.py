@@ -13,6 +13,7 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
+from bevcli.model.road_slopes import RoadMemory, RoadSlopes, expected_slopes
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import on_device, upload, upload_together
 
@@ -24,10 +25,12 @@ class BevHistory:
     Attributes:
         bev: (1, Y·X, C), the BEV map of the last frame.
         pose: world_from_ego of that frame.
+        road: for a model that levels the rig of each frame.
     """
 
     bev: Tensor
     pose: Pose
+    road: RoadMemory | None = None
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class EncoderInputs:
         image_from_level: (B, N, 4, 4), as image_from_bev, of the rig as the boxes in the images level it; hits and rays
             are of this rig.
         image_boxes: of a detector beside the backbone, None without one.
+        expected_slopes: see `ModelInputs`.
         hits: the cells that each camera sees.
         rays: scale and shift of the image features, of the calibration embedding; None without one.
         history: (B, Y·X, C), the BEV map of the previous frame; None without history.
@@ -58,6 +62,7 @@ class EncoderInputs:
     history: Tensor | None
     rotation: Tensor | None
     image_boxes: ImageBoxes | None = None
+    expected_slopes: RoadSlopes | None = None
 
 
 class BEVFormer(Network):
@@ -69,26 +74,44 @@ class BEVFormer(Network):
         self, prepared: PreparedFrame, memory: BevHistory | None, upcoming: Sequence[PreparedFrame] = ()
     ) -> tuple[ModelOutputs, BevHistory]:
         inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
-        inputs = replace(inputs, images=upload(inputs.images, self.device))
+        expected = self.slopes_before(prepared, memory)
+        inputs = replace(inputs, images=upload(inputs.images, self.device), expected_slopes=expected)
         outputs = self(inputs, None if memory is None else memory.bev)
-        return outputs, BevHistory(outputs.bev, prepared.frame.world_from_ego)
+        return outputs, self.history_after(prepared, outputs.bev, outputs.road_slopes)
+
+    @staticmethod
+    def slopes_before(prepared: PreparedFrame, memory: BevHistory | None) -> RoadSlopes | None:
+        """See `expected_slopes`; memory: of the frame before."""
+        road, pose = (None, None) if memory is None else (memory.road, memory.pose)
+        return expected_slopes(road, pose, prepared.grey, prepared.frame.world_from_ego)
+
+    @staticmethod
+    def history_after(prepared: PreparedFrame, bev: Tensor, slopes: RoadSlopes | None) -> BevHistory:
+        """The memory after a frame. bev, slopes: of the model's outputs."""
+        road = None if prepared.grey is None or slopes is None else RoadMemory(prepared.grey, slopes)
+        return BevHistory(bev, prepared.frame.world_from_ego, road)
 
     def forward(self, inputs: ModelInputs, history: Tensor | None = None) -> ModelOutputs:
         """One step. history: (B, Y·X, C), the BEV map of the previous frame, or None for a scene's first frame."""
-        outputs: ModelOutputs = self.compute(self.geometry(inputs, history))
-        return outputs
+        encoder_inputs, slopes = self.geometry(inputs, history)
+        outputs: ModelOutputs = self.compute(encoder_inputs)
+        return outputs if slopes is None else replace(outputs, road_slopes=slopes)
 
-    def geometry(self, inputs: ModelInputs, history: Tensor | None) -> EncoderInputs:
-        """The host part of a step: what it needs of calibration and poses, as tensors. Arguments as for `forward`."""
+    def geometry(self, inputs: ModelInputs, history: Tensor | None) -> tuple[EncoderInputs, RoadSlopes | None]:
+        """The host part of a step: what it needs of calibration and poses, as tensors; and the slopes of the road.
+
+        Arguments as for `forward`.
+        """
         size = inputs.image_size
         rays = rotation = None
-        boxes, image_from_level = self.look(inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
+        cameras = inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes
+        boxes, image_from_level, slopes = self.look(*cameras, inputs.expected_slopes)
         if self.calibration_embedding is not None:
             rays = self.calibration_embedding(image_from_level, self.config.level_shapes_of(size), size)
         if history is not None:
             center = self.config.ego_motion.history_rotation_center
             rotation = map_rotation(inputs.rotation_deg, self.config.bev_grid, center)
-        return EncoderInputs(
+        encoder_inputs = EncoderInputs(
             images=inputs.images,
             image_from_bev=inputs.image_from_bev,
             image_from_level=image_from_level,
@@ -102,7 +125,9 @@ class BEVFormer(Network):
             history=history,
             rotation=rotation,
             image_boxes=boxes,
+            expected_slopes=inputs.expected_slopes,
         )
+        return encoder_inputs, slopes
 
     @on_device
     def compute(self, inputs: EncoderInputs, heads: bool = True) -> Any:
@@ -128,7 +153,7 @@ class BEVFormer(Network):
             return bev
         boxes = inputs.image_boxes or self.backbone.image_boxes(maps, inputs.has_image, inputs.image_sizes)
         cameras = inputs.image_from_bev, inputs.image_from_level, inputs.image_sizes
-        return self.detect_with_images(bev, boxes, *cameras)
+        return self.detect_with_images(bev, boxes, *cameras, inputs.expected_slopes)
 
     def with_pose(self, memory: BevHistory, pose: Pose) -> BevHistory:
         """See `TemporalModel`."""
@@ -140,7 +165,7 @@ class BEVFormer(Network):
 
     def history_of_clip(self, clip: Clip, frame: int, memory: Tensor | None) -> Tensor:
         """See `Network`; the memory of clips is their BEV map (B, Y·X, C)."""
-        bev: Tensor = self.compute(self.geometry(clip.inputs[frame], memory), False)
+        bev: Tensor = self.compute(self.geometry(clip.inputs[frame], memory)[0], False)
         return bev
 
     def outputs_of_clip(self, clip: Clip, frame: int, memory: Tensor | None) -> tuple[ModelOutputs, Tensor]:

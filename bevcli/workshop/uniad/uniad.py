@@ -193,7 +193,7 @@ class UniAD(BEVFormer):
             tracks: of the previous frame; None for the first frame of all.
             motion: since the previous frame; needed with tracks.
         """
-        bev = self.compute(self.geometry(inputs, history), False)  # the CPU chooses the tracks
+        bev = self.compute(self.geometry(inputs, history)[0], False)  # the CPU chooses the tracks
         outputs = self.track(bev, tracks, motion)
         with without_autocast(bev.device):
             return replace(outputs, map=self.map_head(bev.float()))

@@ -1,0 +1,167 @@
+"""The slopes of the road relative to the vehicle, which pitches and rolls: what images of two frames tell of them.
+
+The vehicle travels along the road, so that its way in the images tells the pitch; and how all points turn tells by how
+much pitch and roll changed. The boxes of a detector tell both once more (`bevcli.model.lift`), less exactly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bevcli.geometry.transforms import Array, Pose, inverse, rotation_about_z, yaw_of_rotation
+
+SPREAD = 0.016  # standard deviation of a slope that nothing was measured of
+DRIFT = 3.5e-4  # what the change of a slope between two frames is not known better than
+POINTS, APART = 200, 8  # an image; pixels between them
+WINDOW, LEVELS = (15, 15), 4  # of the optical flow
+RETURNED = 0.7  # pixels within which a point that is followed there and back comes back
+SCALE = 0.7  # of residuals, pixels: those far beyond are of what moves by itself
+FEWEST, AGREE = 30, 0.6  # points; share of them within two scales. With less the poses are not of these images
+STANDS_M = 0.05  # a shorter way shows no direction
+STEPS, DIFFERENCE = 6, 1e-6
+
+
+@dataclass(frozen=True)
+class RoadSlopes:
+    """Slopes of the road in the bev frame, along its x and y axis.
+
+    Attributes:
+        mean: (B, 2).
+        covariance: (B, 2, 2).
+    """
+
+    mean: Tensor
+    covariance: Tensor
+
+    @classmethod
+    def of_names(cls, tensors: Mapping[str, Tensor]) -> "RoadSlopes | None":
+        """Of the outputs of an exported file; None where it has none."""
+        return cls(tensors["road_slopes"], tensors["road_covariance"]) if "road_slopes" in tensors else None
+
+
+@dataclass(frozen=True)
+class GreyView:
+    """The images of a frame, small and grey.
+
+    Attributes:
+        images: (N, h, w) uint8, 0 where there is no image.
+        image_from_bev: (N, 4, 4) float64, bev metres to pixels of these images.
+        ego_from_bev: (4, 4) float64.
+    """
+
+    images: Tensor
+    image_from_bev: Tensor
+    ego_from_bev: Tensor
+
+
+@dataclass(frozen=True)
+class RoadMemory:
+    """What is kept of a frame for the next one: its images, and the slopes that all of it told."""
+
+    view: GreyView
+    slopes: RoadSlopes
+
+
+def expected_slopes(
+    memory: RoadMemory | None, before: Pose | None, view: GreyView | None, now: Pose
+) -> RoadSlopes | None:
+    """The slopes of a frame before its boxes are looked at; None for a model that does not ask for them.
+
+    memory, before: of the last frame, None without one. view, now: of this frame, as world_from_ego.
+    """
+    if view is None:
+        return None
+    mean, covariance = np.zeros(2), SPREAD**2 * np.eye(2)
+    if memory is not None and before is not None:
+        first, second = (
+            _level(pose.matrix @ of.ego_from_bev.numpy()) for pose, of in ((before, memory.view), (now, view))
+        )
+        told = slopes_by_points(memory.view, view, inverse(second) @ first)
+        if told is not None:
+            information, pull = told
+            old = np.linalg.inv(memory.slopes.covariance[0].double().numpy())
+            information[:2, :2] += old
+            pull[:2] += old @ memory.slopes.mean[0].double().numpy()
+            information[2:, 2:] += np.eye(2) / SPREAD**2
+            both = np.linalg.inv(information)
+            mean, covariance = (both @ pull)[2:], both[2:, 2:] + DRIFT**2 * np.eye(2)
+    return RoadSlopes(*(torch.from_numpy(x)[None].float() for x in (mean, covariance)))
+
+
+def slopes_by_points(first: GreyView, second: GreyView, b_from_a: Array) -> tuple[Array, Array] | None:
+    """What points of the images of two frames tell of the slopes (x, y of the first, x, y of the second).
+
+    b_from_a: (4, 4) between the frames that the bev frames would be if the vehicle were level with the road.
+
+    Returns the information matrix (4, 4) and its product (4,) with the slopes; None where too few points agree.
+    """
+    rays_a: list[Array] = []
+    rays_b: list[Array] = []
+    focal, shift = [], []
+    pairs = zip(*(x.numpy() for of in (first, second) for x in (of.images, of.image_from_bev)), strict=True)
+    for image_a, from_bev_a, image_b, from_bev_b in pairs:
+        start, end = _followed(image_a, image_b)
+        turn_a, turn_b = (np.linalg.inv(matrix[:3, :3]) for matrix in (from_bev_a, from_bev_b))
+        for rays, turn, pixels in ((rays_a, turn_a, start), (rays_b, turn_b, end)):
+            way = np.column_stack([pixels, np.ones(len(pixels))]) @ turn.T
+            rays.append(way / np.linalg.norm(way, axis=-1, keepdims=True))
+        focal.append(np.full(len(start), 1 / np.linalg.norm(turn_b[:, 0])))
+        at_a, at_b = -turn_a @ from_bev_a[:3, 3], -turn_b @ from_bev_b[:3, 3]
+        shift.append(np.broadcast_to(b_from_a[:3, :3] @ at_a + b_from_a[:3, 3] - at_b, (len(start), 3)))
+    a, b, pixels_of_ray, ways = (np.concatenate(x) for x in (rays_a, rays_b, focal, shift))
+    if len(a) < FEWEST:
+        return None
+    stands = np.linalg.norm(b_from_a[:3, 3]) < STANDS_M
+    ways = ways / np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-9)
+
+    def residuals(slopes: Array) -> Array:
+        """Distances from the epipolar lines; of a vehicle that stands, from where the points were. Pixels."""
+        turned, seen = a @ (b_from_a[:3, :3] @ level_from_bev(slopes[:2])).T, b @ level_from_bev(slopes[2:]).T
+        if stands:
+            return np.asarray((pixels_of_ray[:, None] * np.cross(turned, seen)).ravel())
+        normal_a, normal_b = np.cross(ways, turned), np.cross(ways, seen)
+        length = np.sqrt((normal_a**2).sum(-1) + (normal_b**2).sum(-1))
+        return np.asarray(pixels_of_ray * (seen * normal_a).sum(-1) / np.maximum(length, 1e-9))
+
+    slopes, prior = np.zeros(4), np.eye(4) / SPREAD**2
+    for _ in range(STEPS):
+        here = residuals(slopes)
+        rows = np.stack([(residuals(slopes + step) - here) / DIFFERENCE for step in DIFFERENCE * np.eye(4)], -1)
+        weights = 1 / (1 + (here / SCALE) ** 2) / (2 * SCALE**2)
+        information, pull = rows.T @ (rows * weights[:, None]), rows.T @ (weights * here)
+        slopes = slopes - np.linalg.solve(information + prior, pull + prior @ slopes)
+    if (np.abs(residuals(slopes)) < 2 * SCALE).mean() < AGREE:
+        return None
+    return information, information @ slopes + prior @ slopes
+
+
+def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Pixels (n, 2) of points in two images."""
+    nothing = np.zeros((0, 2)), np.zeros((0, 2))
+    start = cv2.goodFeaturesToTrack(first, POINTS, 0.01, APART)
+    if start is None or not second.any():
+        return nothing
+    end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=WINDOW, maxLevel=LEVELS)  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, end, None, winSize=WINDOW, maxLevel=LEVELS)  # type: ignore[call-overload]
+    kept = (np.linalg.norm(back - start, axis=-1) < RETURNED).ravel() & (there.ravel() > 0) & (again.ravel() > 0)
+    return start[kept, 0].astype(np.float64), end[kept, 0].astype(np.float64)
+
+
+def level_from_bev(slopes: Array) -> Array:
+    """(3, 3), for a road with slopes (2,) in the bev frame; the heading stays."""
+    forward, up = np.array([1.0, 0.0, slopes[0]]), np.array([-slopes[0], -slopes[1], 1.0])
+    x, z = forward / np.linalg.norm(forward), up / np.linalg.norm(up)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _level(world_from_bev: Array) -> Array:
+    """(4, 4): a pose without pitch, roll and height."""
+    level = np.eye(4)
+    level[:3, :3] = rotation_about_z(yaw_of_rotation(world_from_bev[:3, :3]))
+    level[:2, 3] = world_from_bev[:2, 3]
+    return level
