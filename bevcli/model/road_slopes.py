@@ -39,6 +39,11 @@ class RoadSlopes:
     covariance: Tensor
 
     @classmethod
+    def unknown(cls) -> "RoadSlopes":
+        """Where nothing was measured."""
+        return cls(torch.zeros(1, 2), SPREAD**2 * torch.eye(2)[None])
+
+    @classmethod
     def of_names(cls, tensors: Mapping[str, Tensor]) -> "RoadSlopes | None":
         """Of the outputs of an exported file; None where it has none."""
         return cls(tensors["road_slopes"], tensors["road_covariance"]) if "road_slopes" in tensors else None
@@ -76,21 +81,21 @@ def expected_slopes(
     """
     if view is None:
         return None
-    mean, covariance = np.zeros(2), SPREAD**2 * np.eye(2)
-    if memory is not None and before is not None:
-        first, second = (
-            _level(pose.matrix @ of.ego_from_bev.numpy()) for pose, of in ((before, memory.view), (now, view))
-        )
-        told = slopes_by_points(memory.view, view, inverse(second) @ first)
-        if told is not None:
-            information, pull = told
-            old = np.linalg.inv(memory.slopes.covariance[0].double().numpy())
-            information[:2, :2] += old
-            pull[:2] += old @ memory.slopes.mean[0].double().numpy()
-            information[2:, 2:] += np.eye(2) / SPREAD**2
-            both = np.linalg.inv(information)
-            mean, covariance = (both @ pull)[2:], both[2:, 2:] + DRIFT**2 * np.eye(2)
-    return RoadSlopes(*(torch.from_numpy(x)[None].float() for x in (mean, covariance)))
+    if memory is None or before is None:
+        return RoadSlopes.unknown()
+    first = _level(before.matrix @ memory.view.ego_from_bev.numpy())
+    second = _level(now.matrix @ view.ego_from_bev.numpy())
+    told = slopes_by_points(memory.view, view, inverse(second) @ first)
+    if told is None:
+        return RoadSlopes.unknown()
+    information, pull = told
+    old = np.linalg.inv(memory.slopes.covariance[0].double().numpy())
+    information[:2, :2] += old
+    pull[:2] += old @ memory.slopes.mean[0].double().numpy()
+    information[2:, 2:] += np.eye(2) / SPREAD**2
+    both = np.linalg.inv(information)
+    numbers = (both @ pull)[2:], both[2:, 2:] + DRIFT**2 * np.eye(2)
+    return RoadSlopes(*(torch.from_numpy(x)[None].float() for x in numbers))
 
 
 def slopes_by_points(first: GreyView, second: GreyView, b_from_a: Array) -> tuple[Array, Array] | None:

@@ -299,7 +299,7 @@ def loss(lift: Lift, frames: dict[str, Tensor]) -> Tensor:
     found = ImageBoxes(
         *(frames[key].float() if key == "features" else frames[key] for key in parts), cells=frames["boxes"]
     )
-    logits, codes, slopes, _ = lift(found, frames["image_from_bev"], frames["sizes"])
+    logits, codes, slopes = lift(found, frames["image_from_bev"], frames["sizes"])
     label, truth, counts = frames["label"].flatten(1), frames["truth"].flatten(1, 2), frames["scores"].flatten(1) > 0
     good = (label >= 0) & counts & (frames["labels"].flatten(1) >= 0)
     target, off = torch.zeros_like(logits), (codes[..., :2] - truth[..., :2]).square().sum(-1).add(1e-4).sqrt()
@@ -312,7 +312,7 @@ def loss(lift: Lift, frames: dict[str, Tensor]) -> Tensor:
     near = (1 - torch.exp(-off[:, None] / DISTANCES_M)).mean(-1)
     place = (weights * (nn.functional.smooth_l1_loss(relative, 0 * relative, reduction="none", beta=0.3) + near)).sum()
     shape = 0.2 * error[:, [2, 3, 5]].mean() + 0.1 * error[:, 4].mean() + 0.1 * error[:, 6:8].mean()
-    tilt = (slopes - frames["slopes"]).abs().mean() * 180 / math.pi
+    tilt = (slopes.mean - frames["slopes"]).abs().mean() * 180 / math.pi
     return scores + place / weights.sum() + shape + 0.3 * tilt
 
 

@@ -2,13 +2,14 @@
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.deformable_attention import FeatureMaps
@@ -16,6 +17,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, 
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.road_slopes import SPREAD, RoadSlopes
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
 
@@ -98,7 +100,7 @@ def with_most_cameras(outputs: Sequence[Output], most_cameras: Output) -> tuple[
 class RecurrentStep(ExportedStep):
     """`BEVFormer.forward` as a graph, which has no optional inputs: `use_previous` says whether there is a history."""
 
-    def forward(
+    def forward(  # noqa: PLR0913 - the inputs of the file
         self,
         images: Tensor,
         image_from_bev: Tensor,
@@ -110,11 +112,16 @@ class RecurrentStep(ExportedStep):
         previous_bev: Tensor,
         use_previous: Tensor,
         image_sizes: Tensor | None = None,
+        expected_slopes: Tensor | None = None,
+        expected_covariance: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """One step; `RecurrentForm` documents every input and output."""
         network = self.network
         images = self.normalised(images)
-        boxes, image_from_level = network.look(images, has_image, image_from_bev, image_sizes)
+        expected = None
+        if expected_slopes is not None and expected_covariance is not None:
+            expected = RoadSlopes(expected_slopes, expected_covariance)
+        boxes, image_from_level, slopes = network.look(images, has_image, image_from_bev, image_sizes, expected)
         maps = network.image_maps(images)
         image_features = network.tokens_of(maps, camera_index)
         if network.calibration_embedding is not None:
@@ -134,8 +141,8 @@ class RecurrentStep(ExportedStep):
             bev_maps = torch.where(use_previous, with_history, torch.stack([bev, bev], dim=1))
             bev = layer(bev, position, bev_maps, reference_points, image_features, hits)
         boxes = boxes or network.backbone.image_boxes(maps, has_image, image_sizes)
-        outputs = network.detect_with_images(bev, boxes, image_from_bev, image_from_level, image_sizes)
-        boxes = outputs.image_boxes
+        outputs = network.detect_with_images(bev, boxes, image_from_bev, image_from_level, image_sizes, expected)
+        boxes, outputs = outputs.image_boxes, replace(outputs, road_slopes=slopes)
         return (*self.outputs(outputs, hits.most_cameras), *(boxes.by_name.values() if boxes else ()))
 
 
@@ -244,6 +251,21 @@ MOST_CAMERAS = Port(
     "(1,): the largest number of cameras that see one cell of the BEV map. If it exceeds the metadata's "
     "cameras_per_cell, cameras are left out, and the results are wrong: export with more.",
     torch.int64,
+)
+
+
+EXPECTED_SLOPES = (  # inputs of a model that levels the rig
+    Port(
+        "expected_slopes",
+        (1, 2),
+        "(1, 2): of the road along x and y of the bev frame, as bevcli.model.road_slopes expects them by the frame "
+        "before; 0 where nothing is known.",
+    ),
+    Port(
+        "expected_covariance",
+        (1, 2, 2),
+        f"(1, 2, 2): of expected_slopes; {SPREAD**2:g} times the identity where nothing is known.",
+    ),
 )
 
 
@@ -392,17 +414,19 @@ class RecurrentForm(ExportForm):
         lead = (1, self.cameras)
         meaning = "(1, N, 2): width and height of each image within its padding, pixels of the resized image."
         sizes = (Port("image_sizes", (*lead, 2), meaning),) if self.config.image_classes else ()
-        return (*camera_ports(self.config, lead), *_history_ports(self.config), *sizes)
+        slopes = EXPECTED_SLOPES if self.config.levels else ()
+        return (*camera_ports(self.config, lead), *_history_ports(self.config), *sizes, *slopes)
 
     def outputs(self, *, decode: bool) -> tuple[Port, ...]:
         return (*super().outputs(decode=decode), *_image_box_ports(self.config, self.cameras))
 
     def feed(self, prepared: PreparedFrame, memory: Any) -> dict[str, Tensor]:
         inputs = model_inputs(prepared, None if memory is None else memory.pose, self.config)
+        inputs = replace(inputs, expected_slopes=BEVFormer.slopes_before(prepared, memory))
         return recurrent_feed(inputs, None if memory is None else memory.bev, self.config)
 
     def memory(self, prepared: PreparedFrame, memory: Any, by_name: Mapping[str, Tensor]) -> Any:
-        return model_class(self.config).memory_type(by_name["bev"], prepared.frame.world_from_ego)
+        return BEVFormer.history_after(prepared, by_name["bev"], RoadSlopes.of_names(by_name))
 
 
 def _history_ports(config: ModelConfig) -> Iterator[Port]:
@@ -436,6 +460,9 @@ def recurrent_feed(inputs: ModelInputs, history: Tensor | None, config: ModelCon
     grid = config.bev_grid
     previous = torch.zeros(1, grid.rows * grid.columns, config.channels) if history is None else history
     sizes = {"image_sizes": inputs.image_sizes} if config.image_classes else {}
+    if config.levels:
+        expected = inputs.expected_slopes or RoadSlopes.unknown()
+        sizes |= {"expected_slopes": expected.mean, "expected_covariance": expected.covariance}
     return (
         camera_feed(inputs)
         | sizes

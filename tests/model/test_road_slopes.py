@@ -1,0 +1,73 @@
+"""The pitch and roll of the vehicle, by points that images of two frames show."""
+
+import numpy as np
+import pytest
+import torch
+
+from bevcli.geometry.transforms import Pose
+from bevcli.model.road_slopes import SPREAD, GreyView, RoadMemory, RoadSlopes, expected_slopes, level_from_bev
+
+WIDTH, HEIGHT, FOCAL = 512, 288, 280.0
+POINTS = np.random.default_rng(0).uniform((-40, -40, -1.5), (40, 40, 6), (4000, 3))
+SHADES = np.random.default_rng(1).integers(80, 255, len(POINTS))
+YAWS = np.radians([0, 90, 180, 270])
+
+
+def seen(slopes=(0.0, 0.0), ahead=0.0) -> GreyView:
+    """Dots around a rig of four cameras that travelled `ahead` metres along y and is tilted by slopes."""
+    images, projections = np.zeros((len(YAWS), HEIGHT, WIDTH), np.uint8), []
+    points = (POINTS - [0.0, ahead, 0.0]) @ level_from_bev(np.array(slopes))  # in the tilted bev frame
+    for image, yaw in zip(images, YAWS, strict=True):
+        right, forward = (np.cos(yaw), np.sin(yaw), 0.0), (-np.sin(yaw), np.cos(yaw), 0.0)
+        camera_from_bev = np.array([right, (0.0, 0.0, -1.0), forward])
+        matrix = np.eye(4)
+        matrix[:3, :3] = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]) @ camera_from_bev
+        projections.append(matrix)
+        at = points @ matrix[:3, :3].T
+        for (u, v, depth), shade in zip(at, SHADES, strict=True):
+            if depth > 4 and 2 < u / depth < WIDTH - 3 and 2 < v / depth < HEIGHT - 3:
+                column, row = u / depth, v / depth
+                x, y = int(column), int(row)
+                for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # spread over pixels by nearness
+                    weight = (1 - abs(column - x - i)) * (1 - abs(row - y - j))
+                    image[y + j, x + i] = max(image[y + j, x + i], shade * weight)
+    return GreyView(
+        torch.from_numpy(images), torch.from_numpy(np.stack(projections)), torch.eye(4, dtype=torch.float64)
+    )
+
+
+def told(before: GreyView, now: GreyView, ahead: float, known: RoadSlopes | None = None) -> RoadSlopes:
+    """What is expected of the second frame; known: of the first."""
+    memory = RoadMemory(before, known or RoadSlopes.unknown())
+    poses = [Pose.from_matrix(np.block([[np.eye(3), np.array([[0], [y], [0]])], [np.zeros(3), 1]])) for y in (0, ahead)]
+    return expected_slopes(memory, poses[0], now, poses[1])
+
+
+def test_the_way_along_the_road_tells_the_pitch_and_turns_tell_changes():
+    first, second = (0.004, -0.01), (-0.006, 0.015)  # along x: roll, along y: pitch
+    before, now = seen(first), seen(second, ahead=2.0)
+    alone = told(before, now, 2.0)
+    assert alone.mean[0, 1] == pytest.approx(second[1], abs=0.002)
+    assert alone.covariance[0, 1, 1] ** 0.5 < 0.006 < 0.5 * SPREAD < alone.covariance[0, 0, 0] ** 0.5
+    known = RoadSlopes(torch.tensor([first]), 1e-7 * torch.eye(2)[None])
+    assert told(before, now, 2.0, known).mean[0].tolist() == pytest.approx(second, abs=0.001)
+
+
+def test_a_vehicle_that_stands_keeps_what_was_known():
+    first, second = (0.004, -0.01), (-0.006, 0.015)
+    known = RoadSlopes(torch.tensor([first]), 1e-6 * torch.eye(2)[None])
+    result = told(seen(first), seen(second), 0.0, known)
+    assert result.mean[0].tolist() == pytest.approx(second, abs=0.001)
+
+
+def test_nothing_is_told_by_poses_of_other_images_nor_by_empty_ones():
+    before, now = seen(), seen(ahead=2.5)
+    empty = GreyView(torch.zeros_like(now.images), now.image_from_bev, now.ego_from_bev)
+    sideways = Pose.from_matrix(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [np.zeros(3), 1]]))
+    memory = RoadMemory(before, RoadSlopes(torch.ones(1, 2), 1e-6 * torch.eye(2)[None]))
+    for view in (now, empty):
+        result = expected_slopes(memory, Pose.identity(), view, sideways)
+        assert torch.equal(result.covariance, RoadSlopes.unknown().covariance)
+        assert not result.mean.any()
+    assert expected_slopes(memory, Pose.identity(), None, sideways) is None
+    assert torch.equal(expected_slopes(None, None, now, sideways).mean, torch.zeros(1, 2))
