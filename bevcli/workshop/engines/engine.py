@@ -238,7 +238,7 @@ class OpenVinoEngine(Engine):
             raise _cannot_load(file, "OpenVINO", error) from error
         self.metadata = {entry.key: entry.value for entry in proto.metadata_props}
         self.input_shapes = {port.any_name: tuple(port.shape) for port in self.model.inputs}
-        self.outputs = tuple(port.any_name for port in self.model.outputs)
+        self.outputs = tuple(port.name for port in proto.graph.output)  # a port may have names of OpenVINO's too
         self.request = self.model.create_infer_request()
 
     def forward(self, feed: Arrays) -> dict[str, np.ndarray]:
