@@ -150,9 +150,9 @@ class Lift(nn.Module):
 
 
 def inverse_of_two(matrices: Tensor) -> Tensor:
-    """Of symmetric matrices (..., 2, 2), by operations that exported files have."""
+    """Of symmetric matrices (..., 2, 2), by operations that exported files have; 0 for 0."""
     (xx, xy), (_, yy) = (row.unbind(-1) for row in matrices.unbind(-2))
-    return torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2)) / (xx * yy - xy * xy)[..., None, None]
+    return torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2)) / (xx * yy - xy * xy).clamp(min=1e-20)[..., None, None]
 
 
 class Rays:
