@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, branch
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
-from bevcli.model.lift import NO_BOX, Lift, LiftConfig
+from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.road_slopes import RoadSlopes
 from bevcli.model.upload import upload_together
@@ -147,9 +147,8 @@ class HybridQueries(nn.Module):
         told = self.lift(boxes, *cameras)[-1]
         told = RoadSlopes(*(x.to(image_from_bev.device) for x in (told.mean, told.covariance)))
         slopes, covariance = told.mean, told.covariance
-        (xx, xy), (_, yy) = (row.unbind(-1) for row in covariance.unbind(-2))
-        x, y = slopes.unbind(-1)
-        sureness = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)  # in squares of standard deviations
+        information = inverse_of_two(covariance)
+        sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
         slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
         one, zero = torch.ones_like(slopes[:, :1]), torch.zeros_like(slopes[:, :1])
         forward, up = torch.cat([one, zero, slopes[:, :1]], -1), torch.cat([-slopes, one], -1)
