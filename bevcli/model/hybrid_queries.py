@@ -145,7 +145,8 @@ class HybridQueries(nn.Module):
         """
         cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
         told = self.lift(boxes, *cameras)[-1]
-        told = RoadSlopes(*(x.to(image_from_bev.device) for x in (told.mean, told.covariance)))
+        numbers = torch.cat([told.mean[..., None], told.covariance], -1).to(image_from_bev.device)  # one copy
+        told = RoadSlopes(numbers[..., 0], numbers[..., 1:])
         slopes, covariance = told.mean, told.covariance
         information = inverse_of_two(covariance)
         sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
