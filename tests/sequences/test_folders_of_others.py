@@ -183,7 +183,7 @@ LAYOUTS = [
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_kitti_as_it_lies_on_disk(tmp_path, layout):
     drive = kitti_raw(tmp_path) if layout == "raw" else kitti_odometry(tmp_path, layout)
-    sequence = open_sequence(drive)
+    sequence = open_sequence(drive, image_check=False)  # its images are of another drive
     names = ("image_02", "image_03") if layout == "raw" else ("image_2", "image_3")
     assert sequence.rig.names == names
     for name in names:

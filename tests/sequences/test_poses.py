@@ -286,7 +286,7 @@ def test_a_drive_takes_a_file_and_says_what_it_understood(drive, tmp_path):
     still = np.zeros(len(seconds))
     path = tmp_path / "trajectory.log"
     path.write_text(lines(seconds, seconds * 10, *[still] * 5, still + 1))
-    opened = open_sequence(drive, ego_motion_file=path)
+    opened = open_sequence(drive, ego_motion_file=path, image_check=False)  # the images are of another drive
     own = open_sequence(drive)
     assert opened.load(1).world_from_ego.translation == pytest.approx(own.load(1).world_from_ego.translation)
     assert any(re.match(r"poses: TUM, 18 rows at 10.0 Hz, seconds, .*cover all frames", note) for note in opened.notes)
