@@ -37,22 +37,14 @@ OFFICIAL = ("img_backbone.", "img_neck.", "pts_bbox_head.")  # of names in the r
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The contents of a weights file.
+    """The contents of a weights file."""
 
-    Attributes:
-        path: the file.
-        state: state dict with our key names.
-        official: whether the file uses the key names of the released code.
-        facts: metadata in the file, such as its epoch.
-        left_out: what of the file is for training only and was left out of `state`; "" for nothing.
-        not_read: classes and functions in the file whose objects were not read, such as "numpy.dtype".
-    """
-
-    path: Path
-    state: Mapping[str, Tensor]
-    official: bool
-    facts: Mapping[str, str] = field(default_factory=dict)
-    left_out: str = ""
+    path: Path  # the file
+    state: Mapping[str, Tensor]  # state dict with our key names
+    official: bool  # whether the file uses the key names of the released code
+    facts: Mapping[str, str] = field(default_factory=dict)  # metadata in the file, such as its epoch
+    left_out: str = ""  # what of the file is for training only and was left out of `state`; "" for nothing
+    # classes and functions in the file whose objects were not read, such as "numpy.dtype"
     not_read: tuple[str, ...] = ()
 
     @cached_property

@@ -75,25 +75,15 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding about a calibration or sequence.
+    """One finding about a calibration or sequence."""
 
-    Attributes:
-        code: stable name of the kind of finding, listed in docs/calibration.md.
-        severity: "error", "warning" or "info".
-        camera: name of the camera, None for the whole rig.
-        message: what is wrong.
-        found: the value found, with its unit; "" if there is none.
-        expected: the value expected, with its unit; "" if there is none.
-        advice: what to do; "" if there is none.
-    """
-
-    code: str
-    severity: Severity
-    camera: str | None
-    message: str
-    found: str = ""
-    expected: str = ""
-    advice: str = ""
+    code: str  # stable name of the kind of finding, listed in docs/calibration.md
+    severity: Severity  # "error", "warning" or "info"
+    camera: str | None  # name of the camera, None for the whole rig
+    message: str  # what is wrong
+    found: str = ""  # the value found, with its unit; "" if there is none
+    expected: str = ""  # the value expected, with its unit; "" if there is none
+    advice: str = ""  # what to do; "" if there is none
 
     @property
     def line(self) -> str:

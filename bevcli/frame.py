@@ -91,17 +91,11 @@ class BevMap:
 
 @dataclass(frozen=True)
 class GroundLines:
-    """N lines on the ground, as recordings draw them.
+    """N lines on the ground, as recordings draw them."""
 
-    Attributes:
-        strips: N lines (K, 3) in the world frame, metres.
-        colors: N colours, RGB and opacity, 0 to 255.
-        width: in points of the user interface.
-    """
-
-    strips: list[Array] = field(default_factory=list)
-    colors: list[tuple[int, int, int, int]] = field(default_factory=list)
-    width: float = 1.0
+    strips: list[Array] = field(default_factory=list)  # N lines (K, 3) in the world frame, metres
+    colors: list[tuple[int, int, int, int]] = field(default_factory=list)  # N colours, RGB and opacity, 0 to 255
+    width: float = 1.0  # in points of the user interface
 
 
 class FrameResult:
@@ -229,17 +223,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class DriveFacts:
-    """Statements of a drive about itself, beyond its frames.
+    """Statements of a drive about itself, beyond its frames."""
 
-    Attributes:
-        rendered: whether `bevcli render` made its images.
-        geo_origin: where its world frame is on Earth, None if it does not say.
-        motion_measured: whether its poses are measured from its images.
-    """
-
-    rendered: bool = False
-    geo_origin: GeoOrigin | None = None
-    motion_measured: bool = False
+    rendered: bool = False  # whether `bevcli render` made its images
+    geo_origin: GeoOrigin | None = None  # where its world frame is on Earth, None if it does not say
+    motion_measured: bool = False  # whether its poses are measured from its images
 
 
 class Drive(Protocol):
@@ -335,42 +323,28 @@ class DerivedDrive(Drive):
 
 @dataclass(frozen=True)
 class CameraSamples:
-    """The sampling points of spatial cross-attention in one camera's image.
+    """The sampling points of spatial cross-attention in one camera's image."""
 
-    Attributes:
-        pixels: (K, 2) x, y in the image as read (not the network's input); may lie outside of it.
-        weights: (K,) attention weights, 0 or larger; over all cameras of a probe they sum to about 1.
-    """
-
-    pixels: Array
-    weights: Array
+    pixels: Array  # (K, 2) x, y in the image as read (not the network's input); may lie outside of it
+    weights: Array  # (K,) attention weights, 0 or larger; over all cameras of a probe they sum to about 1
 
 
 @dataclass(frozen=True)
 class Probe:
-    """The sampling points of one BEV cell.
+    """The sampling points of one BEV cell."""
 
-    Attributes:
-        cell_center: (2,) x, y of the cell's centre in the bev frame, metres.
-        cameras: camera -> sampling points, for the cameras that see the cell's pillar.
-    """
-
-    cell_center: Array
-    cameras: Mapping[str, CameraSamples]
+    cell_center: Array  # (2,) x, y of the cell's centre in the bev frame, metres
+    cameras: Mapping[str, CameraSamples]  # camera -> sampling points, for the cameras that see the cell's pillar
 
 
 @dataclass(frozen=True)
 class AttentionView:
-    """Samples of the attentions of the last encoder layer.
+    """Samples of the attentions of the last encoder layer."""
 
-    Attributes:
-        history_weight: (rows, columns) 0 to 1, the share of the previous BEV map in what temporal self-attention
-            sampled for each cell; rows from the smallest y. None where no history was used.
-        probes: one a probed cell, in the order of the request.
-    """
-
+    # (rows, columns) 0 to 1, the share of the previous BEV map in what temporal self-attention sampled for each cell;
+    # rows from the smallest y. None where no history was used
     history_weight: Array | None = None
-    probes: tuple[Probe, ...] = ()
+    probes: tuple[Probe, ...] = ()  # one a probed cell, in the order of the request
 
 
 @dataclass(frozen=True)
@@ -409,15 +383,10 @@ class StartReason(Enum):
 
 @dataclass(frozen=True)
 class NewStart:
-    """A step without history. Its text is "first frame", "gap of 2.5 s" and so on.
+    """A step without history. Its text is "first frame", "gap of 2.5 s" and so on."""
 
-    Attributes:
-        reason: for it.
-        gap_s: time since the frame before, with StartReason.GAP.
-    """
-
-    reason: StartReason
-    gap_s: float = 0.0
+    reason: StartReason  # for it
+    gap_s: float = 0.0  # time since the frame before, with StartReason.GAP
 
     def __str__(self) -> str:
         return f"gap of {self.gap_s:.1f} s" if self.reason is StartReason.GAP else self.reason.value

@@ -32,41 +32,30 @@ _TEXTS = {str, Path, Any, Sequence, Iterable}  # types of options that take any 
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """Help text and spelling of an option, for the command line and the documents.
+    """Help text and spelling of an option, for the command line and the documents."""
 
-    Attributes:
-        help: one or two sentences for `--help` and the documents.
-        panel: heading that the option stands under in `--help`; "" for that of its class.
-        flag: spelling on the command line; "" for the field's name with dashes. With "--yes/--no", both; a short one
-            may follow, as in "--out -o".
-        metavar: name of the value in `--help`; "" for that of its type.
-        parse: makes the value from the text of the command line; raises ValueError with the text and what was expected.
-            None where the type says it.
-        repeatable: whether the flag may be given several times; `parse` then takes the list of texts.
-        flag_value: value that the flag alone stands for, such as "static" for --static. None for a flag with a value.
-        complete: the values that complete a text in a shell.
-        reads: "path" for a file or folder that is read, "path or name" where a name without suffix may stand for
-            it, one of `complete` if that is given; "path or pattern" where a glob pattern may. The command line refuses
-            a missing one before anything slow is imported.
-        hidden: whether only Python has the option.
-        is_argument: whether it is an argument of the command and no flag.
-        mistaken: end of the error about a text that means nothing: the option that it may be for.
-    """
-
-    help: str
-    panel: str = ""
+    help: str  # one or two sentences for `--help` and the documents
+    panel: str = ""  # heading that the option stands under in `--help`; "" for that of its class
+    # spelling on the command line; "" for the field's name with dashes. With "--yes/--no", both; a short one may
+    # follow, as in "--out -o"
     flag: str = ""
-    metavar: str = ""
+    metavar: str = ""  # name of the value in `--help`; "" for that of its type
+    # makes the value from the text of the command line; raises ValueError with the text and what was expected. None
+    # where the type says it
     parse: Callable[[Any], Any] | None = None
-    repeatable: bool = False
+    repeatable: bool = False  # whether the flag may be given several times; `parse` then takes the list of texts
+    # value that the flag alone stands for, such as "static" for --static. None for a flag with a value
     flag_value: Any = None
-    complete: Callable[[str], Iterable[str]] | None = None
+    complete: Callable[[str], Iterable[str]] | None = None  # the values that complete a text in a shell
     minimum: float | None = None
     maximum: float | None = None
+    # "path" for a file or folder that is read, "path or name" where a name without suffix may stand for it, one of
+    # `complete` if that is given; "path or pattern" where a glob pattern may. The command line refuses a missing one
+    # before anything slow is imported
     reads: Reads | None = None
-    hidden: bool = False
-    is_argument: bool = False
-    mistaken: str = ""
+    hidden: bool = False  # whether only Python has the option
+    is_argument: bool = False  # whether it is an argument of the command and no flag
+    mistaken: str = ""  # end of the error about a text that means nothing: the option that it may be for
 
     def spellings(self, name: str) -> list[str]:
         """Those on the command line, such as "--rate" or "--track/--no-track"; --out is -o, too. name: the field."""

@@ -27,24 +27,15 @@ _NAME = re.compile(r"\w[\w.+-]{0,99}")
 
 
 class Source(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of sources.toml.
+    """A table of sources.toml."""
 
-    Attributes:
-        source: a URL, hf://OWNER/REPOSITORY[@REVISION]/FILE or a path; "" if it can be had by hand only.
-        page: where a person finds the file; "" if `source` says it.
-        model: name or TOML file of the model that the weights fit; "" for the name of the table.
-        bytes: size of the file; None if it is not known.
-        sha256: hexadecimal hash of the file, or at least its first 8 digits; "" if it is not known.
-        licence: of the weights, such as "Apache-2.0".
-        published: scores on the nuScenes validation split, by name, 0 to 1; errors in their units.
-    """
-
-    source: str = ""
-    page: str = ""
-    model: str = ""
-    bytes: int | None = None
-    sha256: str = ""
-    licence: str = ""
+    source: str = ""  # a URL, hf://OWNER/REPOSITORY[@REVISION]/FILE or a path; "" if it can be had by hand only
+    page: str = ""  # where a person finds the file; "" if `source` says it
+    model: str = ""  # name or TOML file of the model that the weights fit; "" for the name of the table
+    bytes: int | None = None  # size of the file; None if it is not known
+    sha256: str = ""  # hexadecimal hash of the file, or at least its first 8 digits; "" if it is not known
+    licence: str = ""  # of the weights, such as "Apache-2.0"
+    # scores on the nuScenes validation split, by name, 0 to 1; errors in their units
     published: Mapping[str, float] = {}
 
     def __post_init__(self) -> None:
@@ -91,17 +82,11 @@ class Known(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class NamedWeights:
-    """A name of the table of sources, on this machine.
+    """A name of the table of sources, on this machine."""
 
-    Attributes:
-        name: such as "tiny".
-        source: where it is published.
-        folder: the folder of all downloaded weights.
-    """
-
-    name: str
-    source: Source
-    folder: Path
+    name: str  # such as "tiny"
+    source: Source  # where it is published
+    folder: Path  # the folder of all downloaded weights
 
     @property
     def model(self) -> str:
@@ -152,19 +137,12 @@ class NamedWeights:
 
 @dataclass(frozen=True)
 class HubModel:
-    """A model of a hub, such as "hf:OWNER/NAME", on this machine.
+    """A model of a hub, such as "hf:OWNER/NAME", on this machine."""
 
-    Attributes:
-        contents: of its model file, as TOML would have them.
-        file: the file that states them, for errors.
-        weights: the file of its weights.
-        source: its name and revision, for texts.
-    """
-
-    contents: Mapping[str, Any]
-    file: Path
-    weights: Path
-    source: str
+    contents: Mapping[str, Any]  # of its model file, as TOML would have them
+    file: Path  # the file that states them, for errors
+    weights: Path  # the file of its weights
+    source: str  # its name and revision, for texts
 
 
 def hub_model(name: str, *, fetch: bool = False) -> HubModel:

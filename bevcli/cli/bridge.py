@@ -43,34 +43,21 @@ InputDrive = Annotated[
 
 @dataclass(frozen=True)
 class Part:
-    """The options that a command takes of a dataclass or of `FormatValues`: `Annotated[ModelOptions, Part(only=…)]`.
+    """The options that a command takes of a dataclass or of `FormatValues`: `Annotated[ModelOptions, Part(only=…)]`."""
 
-    Attributes:
-        only: names of its fields; empty for all of them.
-        without: names of fields that the command does not have.
-    """
-
-    only: tuple[str, ...] = ()
-    without: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()  # names of its fields; empty for all of them
+    without: tuple[str, ...] = ()  # names of fields that the command does not have
 
 
 @dataclass(frozen=True)
 class _Flag:
-    """An option or an argument of a command.
+    """An option or an argument of a command."""
 
-    Attributes:
-        name: of the field or the function's parameter.
-        option: as it is stated.
-        kind: type of the value.
-        default: `Parameter.empty` if it is required.
-        panel: heading in `--help`.
-    """
-
-    name: str
-    option: Option
-    kind: Any
-    default: Any
-    panel: str | None
+    name: str  # of the field or the function's parameter
+    option: Option  # as it is stated
+    kind: Any  # type of the value
+    default: Any  # `Parameter.empty` if it is required
+    panel: str | None  # heading in `--help`
 
     def parameter(self) -> Parameter:
         """The parameter of a function, as typer reads it."""

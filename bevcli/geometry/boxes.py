@@ -17,18 +17,13 @@ IMPOSSIBLE = "left out: a size of 0 or less, or not finite"  # boxes that `Boxes
 
 @dataclass(frozen=True)
 class Column:
-    """An optional column of boxes with one value a box. Files, tables, scores and recordings take it from here.
+    """An optional column of boxes with one value a box. Files, tables, scores and recordings take it from here."""
 
-    Attributes:
-        key: its name in JSON, CSV and tables.
-        values: "score": 0 to 1, of all boxes or of none; "share": 0 to 1, or NaN; "text"; "flag": true or false;
-            "count": an integer, 0 or more.
-        recorded: its name in recordings; "" where they do not have it.
-    """
-
-    key: str
+    key: str  # its name in JSON, CSV and tables
+    # "score": 0 to 1, of all boxes or of none; "share": 0 to 1, or NaN; "text"; "flag": true or false; "count": an
+    # integer, 0 or more
     values: Literal["score", "share", "text", "flag", "count"]
-    recorded: str = ""
+    recorded: str = ""  # its name in recordings; "" where they do not have it
 
     @property
     def unknown(self) -> Any:

@@ -42,26 +42,17 @@ def motion_during(seconds: float, kinematics: Kinematics) -> Array:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Poses world_from_ego and kinematics at T times.
+    """Poses world_from_ego and kinematics at T times."""
 
-    Attributes:
-        timestamps_ns: (T,) int64, strictly increasing.
-        translations: (T, 3) metres, world frame.
-        quaternions: (T, 4) w, x, y, z, with the stored sign.
-        accelerations: (T, 3) m/s² with gravity, ego frame.
-        angular_rates: (T, 3) rad/s, ego frame.
-        velocities: (T, 3) m/s, ego frame.
-        velocities_are_stated: whether they come from the input; if not, they are derived from the poses.
-        road_normals: (T, 3) unit vectors that point up from the road, ego frame; None: they are derived from the poses.
-    """
-
-    timestamps_ns: NDArray[np.int64]
-    translations: Array
-    quaternions: Array
-    accelerations: Array
-    angular_rates: Array
-    velocities: Array
+    timestamps_ns: NDArray[np.int64]  # (T,) int64, strictly increasing
+    translations: Array  # (T, 3) metres, world frame
+    quaternions: Array  # (T, 4) w, x, y, z, with the stored sign
+    accelerations: Array  # (T, 3) m/s² with gravity, ego frame
+    angular_rates: Array  # (T, 3) rad/s, ego frame
+    velocities: Array  # (T, 3) m/s, ego frame
+    # whether they come from the input; if not, they are derived from the poses
     velocities_are_stated: bool = field(default=True, kw_only=True)
+    # (T, 3) unit vectors that point up from the road, ego frame; None: they are derived from the poses
     road_normals: Array | None = field(default=None, kw_only=True)
 
     @property

@@ -22,12 +22,9 @@ ERRORS = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 
 @dataclass(frozen=True)
 class ClassRanges:
-    """The ranges of a score.
+    """The ranges of a score."""
 
-    Attributes:
-        class_ranges_m: by class, the distance from the ego vehicle on the ground below which it is scored, metres.
-    """
-
+    # by class, the distance from the ego vehicle on the ground below which it is scored, metres
     class_ranges_m: Mapping[str, float]
 
     def cut_at(self, max_range_m: float) -> Self:
@@ -95,17 +92,11 @@ def ranges_m(classes: Iterable[ObjectClass]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ScoredBoxes:
-    """N boxes of many frames.
+    """N boxes of many frames."""
 
-    Attributes:
-        boxes: with all optional columns.
-        frames: (N,), index of each box's frame.
-        ranges_m: (N,), distance from the ego vehicle on the ground, metres.
-    """
-
-    boxes: Boxes3D
-    frames: NDArray[np.int64]
-    ranges_m: Array
+    boxes: Boxes3D  # with all optional columns
+    frames: NDArray[np.int64]  # (N,), index of each box's frame
+    ranges_m: Array  # (N,), distance from the ego vehicle on the ground, metres
 
     def __len__(self) -> int:
         return len(self.frames)

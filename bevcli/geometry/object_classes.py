@@ -11,33 +11,21 @@ Color = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class ObjectClass:
-    """One class of objects.
+    """One class of objects."""
 
-    Attributes:
-        name: of the class.
-        range_m: distance from the ego vehicle on the ground below which objects are scored, metres.
-        gate_m: largest distance between a box and the place where its track is expected, metres.
-        tracked: whether tracks of the class are scored.
-        attributes: nuScenes attribute of a moving and of a standing object; "" for a class without attributes.
-        undefined_errors: errors of the nuScenes score that the class does not have, by the devkit's names.
-        symmetric: whether front and back of an object are the same.
-        vehicle: whether its objects are drawn into the map layer "vehicle".
-        kitti: type in KITTI's label files; "" for the name.
-        color: RGB, 0 to 255; None for one by the index among the model's classes.
-        mesh: path of a mesh file that is drawn in the boxes of the class; "" for none.
-    """
-
-    name: str
-    range_m: float = 50.0
-    gate_m: float = 4.0
-    tracked: bool = True
+    name: str  # of the class
+    range_m: float = 50.0  # distance from the ego vehicle on the ground below which objects are scored, metres
+    gate_m: float = 4.0  # largest distance between a box and the place where its track is expected, metres
+    tracked: bool = True  # whether tracks of the class are scored
+    # nuScenes attribute of a moving and of a standing object; "" for a class without attributes
     attributes: tuple[str, str] = ("", "")
+    # errors of the nuScenes score that the class does not have, by the devkit's names
     undefined_errors: tuple[str, ...] = ("attr_err",)
-    symmetric: bool = False
-    vehicle: bool = False
-    kitti: str = ""
-    color: Color | None = None
-    mesh: str = ""
+    symmetric: bool = False  # whether front and back of an object are the same
+    vehicle: bool = False  # whether its objects are drawn into the map layer "vehicle"
+    kitti: str = ""  # type in KITTI's label files; "" for the name
+    color: Color | None = None  # RGB, 0 to 255; None for one by the index among the model's classes
+    mesh: str = ""  # path of a mesh file that is drawn in the boxes of the class; "" for none
 
 
 _VEHICLE = ObjectClass("", 50.0, attributes=("vehicle.moving", "vehicle.parked"), undefined_errors=(), vehicle=True)

@@ -153,16 +153,11 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
 
 @dataclass(frozen=True)
 class GeoOrigin:
-    """Place of a drive's world frame on Earth (WGS 84). Its z axis points up.
+    """Place of a drive's world frame on Earth (WGS 84). Its z axis points up."""
 
-    Attributes:
-        latitude_deg: latitude of the world frame's origin, degrees, north is positive.
-        longitude_deg: longitude of the origin, degrees, east is positive.
-        heading_deg: compass direction of the world's x axis, degrees clockwise from north. 90: x is east, y north.
-    """
-
-    latitude_deg: float
-    longitude_deg: float
+    latitude_deg: float  # latitude of the world frame's origin, degrees, north is positive
+    longitude_deg: float  # longitude of the origin, degrees, east is positive
+    # compass direction of the world's x axis, degrees clockwise from north. 90: x is east, y north
     heading_deg: float = EAST_DEG
 
     def latitude_longitude(self, points_world: ArrayLike) -> Array:

@@ -22,19 +22,12 @@ from bevcli.model.temporal_model import TemporalModel
 
 @dataclass(frozen=True)
 class SpatialSamples:
-    """The samples of K' pairs of a camera and a cell in spatial cross-attention.
+    """The samples of K' pairs of a camera and a cell in spatial cross-attention."""
 
-    Attributes:
-        camera: (K',) index in B·N.
-        cell: (K',) index in B·Y·X.
-        locations: (K', heads, L, P, 2) x, y, 0 to 1 over the padded image.
-        weights: (K', heads, L, P), whose sum is 1 for each head.
-    """
-
-    camera: Tensor
-    cell: Tensor
-    locations: Tensor
-    weights: Tensor
+    camera: Tensor  # (K',) index in B·N
+    cell: Tensor  # (K',) index in B·Y·X
+    locations: Tensor  # (K', heads, L, P, 2) x, y, 0 to 1 over the padded image
+    weights: Tensor  # (K', heads, L, P), whose sum is 1 for each head
 
 
 class AttentionProbe(ExitStack):

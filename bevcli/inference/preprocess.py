@@ -232,15 +232,10 @@ SMALLEST_OVERLAP = 1e-3  # pixels; OpenCV leaves out what overlaps less with the
 
 @dataclass(frozen=True)
 class PixelWeights:
-    """The pixels of a row (or column) that each of the n pixels of the resized one is a weighted mean of.
+    """The pixels of a row (or column) that each of the n pixels of the resized one is a weighted mean of."""
 
-    Attributes:
-        first: (n,) int64, index of the first of its K pixels.
-        weights: (K, n) float32, those of its K pixels.
-    """
-
-    first: NDArray[np.int64]
-    weights: NDArray[np.float32]
+    first: NDArray[np.int64]  # (n,) int64, index of the first of its K pixels
+    weights: NDArray[np.float32]  # (K, n) float32, those of its K pixels
 
 
 @lru_cache(maxsize=64)

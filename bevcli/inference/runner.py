@@ -52,27 +52,17 @@ class RunnerState(Generic[Memory]):
 
 @dataclass(frozen=True)
 class BegunStep:
-    """A step that the device may still be computing, see `Runner.begin`.
+    """A step that the device may still be computing, see `Runner.begin`."""
 
-    Attributes:
-        prepared: the frame.
-        marks: of the clock, so far.
-        upcoming: the frames after it that the model sees.
-        start: the state before the frame, without history where it starts anew.
-        started_anew: the reason for it, None where it does not.
-        after: the state after the frame where its numbers are finite, without tracks.
-        read: waits for the outputs, see `read_back`; None for a frame without images.
-        probe: of the attention, where it was asked for.
-    """
-
-    prepared: PreparedFrame
-    marks: list[tuple[str, Any]]
-    upcoming: Sequence[PreparedFrame]
-    start: RunnerState[Any]
-    started_anew: NewStart | None
-    after: RunnerState[Any]
+    prepared: PreparedFrame  # the frame
+    marks: list[tuple[str, Any]]  # of the clock, so far
+    upcoming: Sequence[PreparedFrame]  # the frames after it that the model sees
+    start: RunnerState[Any]  # the state before the frame, without history where it starts anew
+    started_anew: NewStart | None  # the reason for it, None where it does not
+    after: RunnerState[Any]  # the state after the frame where its numbers are finite, without tracks
+    # waits for the outputs, see `read_back`; None for a frame without images
     read: Callable[[], tuple[ModelOutputs, bool]] | None = None
-    probe: AttentionProbe | None = None
+    probe: AttentionProbe | None = None  # of the attention, where it was asked for
 
 
 class Runner:

@@ -22,29 +22,21 @@ OTHER = "other"  # the gate of classes that have none
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """The parameters of the tracker: the table [tracking] of a model's TOML file.
+    """The parameters of the tracker: the table [tracking] of a model's TOML file."""
 
-    Attributes:
-        birth_score: an unmatched box with this score or more starts a track.
-        keep_score: a box with this score or more can continue a track.
-        confirm_frames: number of frames with a box after which a track is confirmed.
-        coast_s: time that a confirmed track lives without a box, in seconds. Other tracks end with the first frame
-            without a box.
-        carry_s: time that a track lives on boxes where no camera looks, in seconds.
-        duplicate_widths: a box is a duplicate when the centre of a better box of its class is closer than this many
-            widths of the better box. 0: no box is a duplicate.
-        use_velocity: whether tracks move with the predicted velocity; if not, they stay where their last box is.
-        gates_m: the largest distance of a match, by class, "other" for other classes, 4 m if left out. `for_classes`
-            adds those of a model's classes.
-    """
-
-    birth_score: float = 0.2
-    keep_score: float = 0.1
-    confirm_frames: int = 2
+    birth_score: float = 0.2  # an unmatched box with this score or more starts a track
+    keep_score: float = 0.1  # a box with this score or more can continue a track
+    confirm_frames: int = 2  # number of frames with a box after which a track is confirmed
+    # time that a confirmed track lives without a box, in seconds. Other tracks end with the first frame without a box
     coast_s: float = 1.5
-    carry_s: float = 3.0
+    carry_s: float = 3.0  # time that a track lives on boxes where no camera looks, in seconds
+    # a box is a duplicate when the centre of a better box of its class is closer than this many widths of the better
+    # box. 0: no box is a duplicate
     duplicate_widths: float = 1.0
+    # whether tracks move with the predicted velocity; if not, they stay where their last box is
     use_velocity: bool = True
+    # the largest distance of a match, by class, "other" for other classes, 4 m if left out. `for_classes` adds those of
+    # a model's classes
     gates_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -111,17 +103,11 @@ class Tracks:
 
 @dataclass(frozen=True)
 class TrackerState:
-    """All that the tracker keeps from one frame to the next.
+    """All that the tracker keeps from one frame to the next."""
 
-    Attributes:
-        tracks: the tracks that live.
-        stamp: of the last frame.
-        next_number: the identity of the next track. It never falls, so that identities differ between scenes, too.
-    """
-
-    tracks: Tracks
-    stamp: FrameStamp
-    next_number: int
+    tracks: Tracks  # the tracks that live
+    stamp: FrameStamp  # of the last frame
+    next_number: int  # the identity of the next track. It never falls, so that identities differ between scenes, too
 
 
 def track(

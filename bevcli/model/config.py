@@ -32,45 +32,36 @@ LARGEST_NUMBER = 20_000
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """The network's input made of an image: resized, cropped, normalised in float, padded at right and bottom.
+    """The network's input made of an image: resized, cropped, normalised in float, padded at right and bottom."""
 
-    Attributes:
-        size: (width, height) in pixels that an image is resized to. Images of another aspect ratio are scaled to fit
-            inside.
-        mean: of each channel, subtracted, on the scale 0 to 255 and in color_order.
-        std: of each channel, the divisor, on the same scale.
-        color_order: order of the channels, "rgb" or "bgr".
-        pad_divisor: width and height are padded with zeros to a multiple of it.
-        resize: "linear", as the published weights were trained, aliases where images shrink to less than half;
-            "area" averages the pixels that fall into one.
-        half_pixel_shift: whether projections follow the resized image exactly: it keeps the corners of the image, so
-            that pixel u goes to (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were
-            trained, which is 0.3 pixels off where 1600 pixels become 512.
-        crop: (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all.
-        focal_px: images of wide cameras become larger than `size`: their median focal length becomes this, in pixels
-            of the network's input, so that objects at the same distance have the same size for every rig
-            (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig.
-        max_pixels: with `focal_px`, images become larger only as long as all images of a frame have no more pixels.
-        auto_levels: move the grey levels of dark, pale and foggy images into an ordinary range first
-            (`bevcli.inference.image_repair.auto_levels`), so that the model sees more in the dark and in fog.
-        defog: take away the light that fog adds to an image, before its levels are moved
-            (`bevcli.inference.image_repair.defogged`).
-        denoise: smooth images with strong noise, as of a camera in the dark
-            (`bevcli.inference.image_repair.denoised`).
-    """
-
+    # (width, height) in pixels that an image is resized to. Images of another aspect ratio are scaled to fit inside
     size: tuple[int, int]
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    color_order: Literal["rgb", "bgr"]
-    pad_divisor: int = 32
+    mean: tuple[float, float, float]  # of each channel, subtracted, on the scale 0 to 255 and in color_order
+    std: tuple[float, float, float]  # of each channel, the divisor, on the same scale
+    color_order: Literal["rgb", "bgr"]  # order of the channels, "rgb" or "bgr"
+    pad_divisor: int = 32  # width and height are padded with zeros to a multiple of it
+    # "linear", as the published weights were trained, aliases where images shrink to less than half; "area" averages
+    # the pixels that fall into one
     resize: Literal["linear", "area"] = "linear"
+    # whether projections follow the resized image exactly: it keeps the corners of the image, so that pixel u goes to
+    # (u + 0.5) * scale - 0.5. If false, it goes to u * scale, as the published weights were trained, which is 0.3
+    # pixels off where 1600 pixels become 512
     half_pixel_shift: bool = False
+    # (left, top, right, bottom) in pixels of the resized image: the part that the network sees. None for all
     crop: tuple[int, int, int, int] | None = None
+    # images of wide cameras become larger than `size`: their median focal length becomes this, in pixels of the
+    # network's input, so that objects at the same distance have the same size for every rig
+    # (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig
     focal_px: float | None = None
+    # with `focal_px`, images become larger only as long as all images of a frame have no more pixels
     max_pixels: int | None = None
+    # move the grey levels of dark, pale and foggy images into an ordinary range first
+    # (`bevcli.inference.image_repair.auto_levels`), so that the model sees more in the dark and in fog
     auto_levels: bool = False
+    # take away the light that fog adds to an image, before its levels are moved
+    # (`bevcli.inference.image_repair.defogged`)
     defog: bool = False
+    # smooth images with strong noise, as of a camera in the dark (`bevcli.inference.image_repair.denoised`)
     denoise: bool = False
 
     def __post_init__(self) -> None:
@@ -107,38 +98,26 @@ class ImageConfig:
 
 @dataclass(frozen=True)
 class BevFrameConfig:
-    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground.
+    """The bev frame that a model was trained in, relative to the ego frame, whose origin is on the ground."""
 
-    Attributes:
-        level: whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a
-            level one with the same heading and origin, at the height `height_m`. If false, the drive's is used.
-        height_m: height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84.
-        follow_road: whether a level bev frame stays level with the road where the poses show that the body pitches and
-            rolls over it (`Frame.road_normal`). If false, it pitches and rolls with the body.
-    """
-
+    # whether the z axis of the bev frame must be vertical. The bev frame of every drive is then replaced by a level one
+    # with the same heading and origin, at the height `height_m`. If false, the drive's is used
     level: bool = False
-    height_m: float = BEV_ORIGIN_M[2]
+    height_m: float = BEV_ORIGIN_M[2]  # height of the origin above the ground, metres; nuScenes' LIDAR_TOP has 1.84
+    # whether a level bev frame stays level with the road where the poses show that the body pitches and rolls over it
+    # (`Frame.road_normal`). If false, it pitches and rolls with the body
     follow_road: bool = False
 
 
 @dataclass(frozen=True)
 class TrainingRigsConfig:
-    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it.
+    """The rigs that a model's weights were trained on. It changes no result: a drive's rig is compared with it."""
 
-    Attributes:
-        cameras: smallest and largest number of cameras; 0 and 0 where the rigs are not known.
-        fov_deg: smallest and largest horizontal field of view.
-        height_m: smallest and largest height of a camera above the ground.
-        tilt_deg: largest pitch or roll of a camera.
-        cost: what other rigs were measured to cost, in words.
-    """
-
-    cameras: tuple[int, int] = (0, 0)
-    fov_deg: tuple[float, float] = (0.0, 180.0)
-    height_m: tuple[float, float] = (0.0, 10.0)
-    tilt_deg: float = 90.0
-    cost: str = ""
+    cameras: tuple[int, int] = (0, 0)  # smallest and largest number of cameras; 0 and 0 where the rigs are not known
+    fov_deg: tuple[float, float] = (0.0, 180.0)  # smallest and largest horizontal field of view
+    height_m: tuple[float, float] = (0.0, 10.0)  # smallest and largest height of a camera above the ground
+    tilt_deg: float = 90.0  # largest pitch or roll of a camera
+    cost: str = ""  # what other rigs were measured to cost, in words
 
     @property
     def known(self) -> bool:

@@ -27,33 +27,23 @@ LEAST_EXPONENT = -60.0  # what is less adds nothing, and takes a CPU up to fifty
 
 @dataclass(frozen=True)
 class DecoderConfig:
-    """The object decoder.
+    """The object decoder."""
 
-    Attributes:
-        layers: number of decoder layers.
-        attention_heads: heads of self-attention and of cross-attention.
-        points: sampling points of a head of the cross-attention to the BEV map.
-        queries: number of object queries.
-        feed_forward_width: channels between the two linear layers of the feed-forward network.
-        dropout: probability, 0 to below 1.
-        max_boxes: number of boxes that are decoded, those with the best scores.
-        merge_duplicates: distance, in sizes of a box, within which boxes of its class count as the same object: they
-            share their places; see `merged`. With 0, as published, boxes stay where they are.
-        fade_duplicates: share of its score that a box loses at the place of a better box of its class, and less beside
-            it; see `faded`. With 0, as published, scores stay as they are.
-        training_groups: number of sets of queries that are trained side by side, each to find every object
-            (Group DETR, Chen et al. 2023). Inference uses the first set only.
-    """
-
-    layers: int = 6
-    attention_heads: int = 8
-    points: int = 4
-    queries: int = 900
-    feed_forward_width: int = 512
-    dropout: float = 0.1
-    max_boxes: int = 300
+    layers: int = 6  # number of decoder layers
+    attention_heads: int = 8  # heads of self-attention and of cross-attention
+    points: int = 4  # sampling points of a head of the cross-attention to the BEV map
+    queries: int = 900  # number of object queries
+    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
+    dropout: float = 0.1  # probability, 0 to below 1
+    max_boxes: int = 300  # number of boxes that are decoded, those with the best scores
+    # distance, in sizes of a box, within which boxes of its class count as the same object: they share their places;
+    # see `merged`. With 0, as published, boxes stay where they are
     merge_duplicates: float = 0.0
+    # share of its score that a box loses at the place of a better box of its class, and less beside it; see `faded`.
+    # With 0, as published, scores stay as they are
     fade_duplicates: float = 0.0
+    # number of sets of queries that are trained side by side, each to find every object (Group DETR, Chen et al. 2023).
+    # Inference uses the first set only
     training_groups: int = 1
 
     def __post_init__(self) -> None:
@@ -75,17 +65,11 @@ class DecoderConfig:
 
 @dataclass(frozen=True)
 class ObjectQueries:
-    """Queries as they enter the first decoder layer.
+    """Queries as they enter the first decoder layer."""
 
-    Attributes:
-        position: (B, Q, C).
-        content: (B, Q, C).
-        reference_points: (B, Q, 3) x, y, z, 0 to 1 over the range.
-    """
-
-    position: Tensor
-    content: Tensor
-    reference_points: Tensor
+    position: Tensor  # (B, Q, C)
+    content: Tensor  # (B, Q, C)
+    reference_points: Tensor  # (B, Q, 3) x, y, z, 0 to 1 over the range
 
 
 class Decoder(nn.Module):
@@ -278,19 +262,12 @@ def branch(channels: int, layers: int, outputs: int) -> RegressionBranch:
 
 
 class BestBoxes(NamedTuple):
-    """The K boxes of each batch element with the best scores, by falling score.
+    """The K boxes of each batch element with the best scores, by falling score."""
 
-    Attributes:
-        query: (B, K), index of the object query.
-        label: (B, K), index of the class.
-        scores: (B, K).
-        codes: (B, K, 10).
-    """
-
-    query: Tensor
-    label: Tensor
-    scores: Tensor
-    codes: Tensor
+    query: Tensor  # (B, K), index of the object query
+    label: Tensor  # (B, K), index of the class
+    scores: Tensor  # (B, K)
+    codes: Tensor  # (B, K, 10)
 
     def decoded(self, classes: Sequence[str]) -> Boxes3D:
         """The boxes of a batch of one, bev frame. classes: of the class logits."""

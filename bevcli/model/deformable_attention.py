@@ -23,15 +23,10 @@ LevelShapes = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class FeatureMaps:
-    """G multi-level feature maps as tokens.
+    """G multi-level feature maps as tokens."""
 
-    Attributes:
-        tokens: (G, S, C), the cells of a map's levels one after another, row by row; S cells in all.
-        level_shapes: (height, width) of each of the L levels.
-    """
-
-    tokens: Tensor
-    level_shapes: LevelShapes
+    tokens: Tensor  # (G, S, C), the cells of a map's levels one after another, row by row; S cells in all
+    level_shapes: LevelShapes  # (height, width) of each of the L levels
 
     def scaled(self, scale: Tensor, shift: Tensor) -> "FeatureMaps":
         """The tokens times the scale plus the shift, in their dtype. scale, shift: (G, S, C) float32."""

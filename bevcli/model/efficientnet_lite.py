@@ -30,19 +30,14 @@ STRIDES = (2, 4, 8, 16, 16, 32, 32)  # pixels of the image per cell after each s
 
 @dataclass(frozen=True)
 class EfficientNetLiteConfig:
-    """The backbone.
-
-    Attributes:
-        kind: chooses this backbone.
-        variant: 0 to 4, from EfficientNet-lite0, the smallest, to EfficientNet-lite4.
-        output_stages: the stages (1 to 7, with strides 2, 4, 8, 16, 16, 32 and 32) whose maps go to the neck. The model
-            has no stages after the last of them.
-    """
+    """The backbone."""
 
     title: ClassVar[str] = "EfficientNet-lite"
 
-    kind: Literal["efficientnet-lite"] = "efficientnet-lite"
-    variant: int = 0
+    kind: Literal["efficientnet-lite"] = "efficientnet-lite"  # chooses this backbone
+    variant: int = 0  # 0 to 4, from EfficientNet-lite0, the smallest, to EfficientNet-lite4
+    # the stages (1 to 7, with strides 2, 4, 8, 16, 16, 32 and 32) whose maps go to the neck. The model has no stages
+    # after the last of them
     output_stages: tuple[int, ...] = (3, 5)
 
     def __post_init__(self) -> None:

@@ -53,17 +53,11 @@ class EgoMotionConfig:
 
 @dataclass(frozen=True)
 class EgoMotionInputs:
-    """The model's ego-motion inputs for one frame.
+    """The model's ego-motion inputs for one frame."""
 
-    Attributes:
-        can_bus: (18,) float32, the translation and the change of heading since the previous frame included.
-        shift: (2,) float32, translation of the history map (x, y) in normalised BEV coordinates.
-        rotation_deg: rotation of the history map.
-    """
-
-    can_bus: np.ndarray
-    shift: np.ndarray
-    rotation_deg: float
+    can_bus: np.ndarray  # (18,) float32, the translation and the change of heading since the previous frame included
+    shift: np.ndarray  # (2,) float32, translation of the history map (x, y) in normalised BEV coordinates
+    rotation_deg: float  # rotation of the history map
 
 
 def ego_motion_inputs(

@@ -22,23 +22,14 @@ from bevcli.model.pillar_projection import PillarHits
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """The encoder.
+    """The encoder."""
 
-    Attributes:
-        layers: number of encoder layers.
-        attention_heads: heads of both attentions.
-        temporal_points: sampling points of a head in each of the two BEV maps.
-        spatial_points: sampling points of a head in each feature level, a multiple of the grid's pillar points.
-        feed_forward_width: channels between the two linear layers of the feed-forward network.
-        dropout: probability, 0 to below 1.
-    """
-
-    layers: int = 6
-    attention_heads: int = 8
-    temporal_points: int = 4
-    spatial_points: int = 8
-    feed_forward_width: int = 512
-    dropout: float = 0.1
+    layers: int = 6  # number of encoder layers
+    attention_heads: int = 8  # heads of both attentions
+    temporal_points: int = 4  # sampling points of a head in each of the two BEV maps
+    spatial_points: int = 8  # sampling points of a head in each feature level, a multiple of the grid's pillar points
+    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
+    dropout: float = 0.1  # probability, 0 to below 1
 
     def __post_init__(self) -> None:
         counts = (self.layers, self.attention_heads, self.temporal_points, self.spatial_points)

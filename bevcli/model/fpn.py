@@ -9,13 +9,9 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class FPNConfig:
-    """The neck.
+    """The neck."""
 
-    Attributes:
-        levels: number of output maps. Those beyond the backbone's maps come from stride-2 convolutions.
-    """
-
-    levels: int = 1
+    levels: int = 1  # number of output maps. Those beyond the backbone's maps come from stride-2 convolutions
 
 
 class FPN(nn.Module):

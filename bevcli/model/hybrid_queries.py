@@ -40,20 +40,14 @@ RANGE_SCALE = 0.05  # of metres, as they enter a layer
 
 @dataclass(frozen=True)
 class HybridQueriesConfig:
-    """The [hybrid_queries] table of a model with a detector.
+    """The [hybrid_queries] table of a model with a detector."""
 
-    Attributes:
-        count: of queries, the best boxes of all cameras; 0 for none.
-        layers: that correct them by the BEV map; with 0 they stay as `Lift` gives them.
-        level: whether the rig of each frame is levelled first, by the slope of the road that the boxes tell, where the
-            detector stands beside the backbone: the vehicle pitches and rolls, and poses rarely state it.
-        features: channels of the detector's maps.
-    """
-
-    count: int = 0
-    layers: int = 0
+    count: int = 0  # of queries, the best boxes of all cameras; 0 for none
+    layers: int = 0  # that correct them by the BEV map; with 0 they stay as `Lift` gives them
+    # whether the rig of each frame is levelled first, by the slope of the road that the boxes tell, where the detector
+    # stands beside the backbone: the vehicle pitches and rolls, and poses rarely state it
     level: bool = False
-    features: int = 128
+    features: int = 128  # channels of the detector's maps
 
     def __post_init__(self) -> None:
         if self.count < 0 or self.layers < 0 or self.features < 1:

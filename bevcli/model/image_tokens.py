@@ -12,17 +12,13 @@ from bevcli.model.upload import upload
 
 @dataclass(frozen=True)
 class ImageTokensConfig:
-    """The embeddings that are added to image features.
+    """The embeddings that are added to image features."""
 
-    Attributes:
-        camera_embedding: whether every image feature gets the learned embedding of its camera.
-        level_embeddings: number of learned level embeddings, at least the neck's levels (published weights hold four).
-        calibration_embedding: whether every image feature gets an embedding of its viewing ray, see
-            `CalibrationEmbedding`. The published models have none.
-    """
-
-    camera_embedding: bool = True
+    camera_embedding: bool = True  # whether every image feature gets the learned embedding of its camera
+    # number of learned level embeddings, at least the neck's levels (published weights hold four)
     level_embeddings: int = 4
+    # whether every image feature gets an embedding of its viewing ray, see `CalibrationEmbedding`. The published models
+    # have none
     calibration_embedding: bool = False
 
 

@@ -28,17 +28,11 @@ OF_IMAGE, OF_RAYS = 8 + len(IMAGE_CLASSES), 15  # numbers that the network is to
 
 @dataclass(frozen=True)
 class LiftConfig:
-    """The lift.
+    """The lift."""
 
-    Attributes:
-        width: channels of its two hidden layers.
-        feature_width: channels to which the features of the detector are reduced; 0 leaves them out.
-        dropout: of these features, probability.
-    """
-
-    width: int = 64
-    feature_width: int = 16
-    dropout: float = 0.2
+    width: int = 64  # channels of its two hidden layers
+    feature_width: int = 16  # channels to which the features of the detector are reduced; 0 leaves them out
+    dropout: float = 0.2  # of these features, probability
 
 
 class Lift(nn.Module):
@@ -152,7 +146,10 @@ class Lift(nn.Module):
 def inverse_of_two(matrices: Tensor) -> Tensor:
     """Of symmetric matrices (..., 2, 2), by operations that exported files have; 0 for 0."""
     (xx, xy), (_, yy) = (row.unbind(-1) for row in matrices.unbind(-2))
-    return torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2)) / (xx * yy - xy * xy).clamp(min=1e-20)[..., None, None]
+    return (
+        torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2))
+        / (xx * yy - xy * xy).clamp(min=1e-20)[..., None, None]
+    )
 
 
 class Rays:

@@ -26,24 +26,17 @@ PIXEL_MEAN, PIXEL_STD = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)  # B 
 
 @dataclass(frozen=True)
 class NanoDetConfig:
-    """The backbone.
-
-    Attributes:
-        kind: chooses this backbone.
-        output_stages: the maps that go to the neck: the first ones of 1, 2 and 3, with strides 8, 16 and 32. The boxes
-            in the images take all three.
-        frozen: whether the weights stay as they are in every training.
-        max_boxes: most boxes in an image.
-        overlap: intersection over union from which on two boxes of a class are one.
-    """
+    """The backbone."""
 
     title: ClassVar[str] = "NanoDet-g"
 
-    kind: Literal["nanodet"] = "nanodet"
+    kind: Literal["nanodet"] = "nanodet"  # chooses this backbone
+    # the maps that go to the neck: the first ones of 1, 2 and 3, with strides 8, 16 and 32. The boxes in the images
+    # take all three
     output_stages: tuple[int, ...] = (1, 2)
-    frozen: bool = True
-    max_boxes: int = 48
-    overlap: float = 0.6
+    frozen: bool = True  # whether the weights stay as they are in every training
+    max_boxes: int = 48  # most boxes in an image
+    overlap: float = 0.6  # intersection over union from which on two boxes of a class are one
 
     def __post_init__(self) -> None:
         if not self.output_stages or self.output_stages != (1, 2, 3)[: len(self.output_stages)]:

@@ -27,15 +27,11 @@ OUTSIDE = -1e4  # x and y of points that lie outside every image, whatever their
 
 @dataclass(frozen=True)
 class PillarProjection:
-    """The pillar points of every BEV cell in every camera.
+    """The pillar points of every BEV cell in every camera."""
 
-    Attributes:
-        reference_points: (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded image; up to 1e7 behind a camera.
-        visible: (B, N, Y·X, Z) bool, whether a point lies inside the image and in front of the camera.
-    """
-
+    # (B, N, Y·X, Z, 2) float32, x and y, 0 to 1 over the padded image; up to 1e7 behind a camera
     reference_points: Tensor
-    visible: Tensor
+    visible: Tensor  # (B, N, Y·X, Z) bool, whether a point lies inside the image and in front of the camera
 
     @property
     def hit(self) -> Tensor:
@@ -45,19 +41,12 @@ class PillarProjection:
 
 @dataclass(frozen=True)
 class PillarHits:
-    """The list of all M pairs of a camera and a cell that it sees, ordered by batch element, camera, cell.
+    """The list of all M pairs of a camera and a cell that it sees, ordered by batch element, camera, cell."""
 
-    Attributes:
-        cell: (M,) int64, index of the cell in B·Y·X.
-        reference_points: (M, Z, 2) float32, x and y of the pillar's points, 0 to 1 over the padded image.
-        hits_per_camera: B·N counts, of sum M.
-        cameras_per_cell: (B·Y·X,) int64, the number of cameras that see a cell.
-    """
-
-    cell: Tensor
-    reference_points: Tensor
-    hits_per_camera: tuple[int, ...]
-    cameras_per_cell: Tensor
+    cell: Tensor  # (M,) int64, index of the cell in B·Y·X
+    reference_points: Tensor  # (M, Z, 2) float32, x and y of the pillar's points, 0 to 1 over the padded image
+    hits_per_camera: tuple[int, ...]  # B·N counts, of sum M
+    cameras_per_cell: Tensor  # (B·Y·X,) int64, the number of cameras that see a cell
 
     @property
     def is_seen(self) -> Tensor:

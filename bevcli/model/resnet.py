@@ -13,25 +13,19 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 
 @dataclass(frozen=True)
 class ResNetConfig:
-    """The backbone.
-
-    Attributes:
-        blocks: number of bottlenecks in each of the four stages; (3, 4, 6, 3) is ResNet-50, (3, 4, 23, 3) ResNet-101.
-        style: which convolution of a stage's first bottleneck has the stride: "pytorch" the 3x3, "caffe" the first 1x1.
-        output_stages: the stages (1 to 4) whose maps go to the neck.
-        deformable_stages: the stages whose 3x3 convolutions are modulated deformable convolutions (DCNv2).
-        width: channels of the stem; stage s has 4 · width · 2^(s - 1) output channels.
-        kind: chooses this backbone.
-    """
+    """The backbone."""
 
     title: ClassVar[str] = "ResNet"
 
+    # number of bottlenecks in each of the four stages; (3, 4, 6, 3) is ResNet-50, (3, 4, 23, 3) ResNet-101
     blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
+    # which convolution of a stage's first bottleneck has the stride: "pytorch" the 3x3, "caffe" the first 1x1
     style: Literal["pytorch", "caffe"] = "pytorch"
-    output_stages: tuple[int, ...] = (4,)
+    output_stages: tuple[int, ...] = (4,)  # the stages (1 to 4) whose maps go to the neck
+    # the stages whose 3x3 convolutions are modulated deformable convolutions (DCNv2)
     deformable_stages: tuple[int, ...] = ()
-    width: int = 64
-    kind: Literal["resnet"] = "resnet"
+    width: int = 64  # channels of the stem; stage s has 4 · width · 2^(s - 1) output channels
+    kind: Literal["resnet"] = "resnet"  # chooses this backbone
 
     def __post_init__(self) -> None:
         stages = self.output_stages + self.deformable_stages

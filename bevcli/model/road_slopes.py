@@ -28,15 +28,10 @@ STEPS, DIFFERENCE = 6, 1e-6
 
 @dataclass(frozen=True)
 class RoadSlopes:
-    """Slopes of the road in the bev frame, along its x and y axis.
+    """Slopes of the road in the bev frame, along its x and y axis."""
 
-    Attributes:
-        mean: (B, 2).
-        covariance: (B, 2, 2).
-    """
-
-    mean: Tensor
-    covariance: Tensor
+    mean: Tensor  # (B, 2)
+    covariance: Tensor  # (B, 2, 2)
 
     @classmethod
     def unknown(cls) -> "RoadSlopes":
@@ -51,17 +46,11 @@ class RoadSlopes:
 
 @dataclass(frozen=True)
 class GreyView:
-    """The images of a frame, small and grey.
+    """The images of a frame, small and grey."""
 
-    Attributes:
-        images: (N, h, w) uint8, 0 where there is no image.
-        image_from_bev: (N, 4, 4) float64, bev metres to pixels of these images.
-        ego_from_bev: (4, 4) float64.
-    """
-
-    images: Tensor
-    image_from_bev: Tensor
-    ego_from_bev: Tensor
+    images: Tensor  # (N, h, w) uint8, 0 where there is no image
+    image_from_bev: Tensor  # (N, 4, 4) float64, bev metres to pixels of these images
+    ego_from_bev: Tensor  # (4, 4) float64
 
 
 @dataclass(frozen=True)

@@ -25,31 +25,18 @@ STUFF_CLASSES, THING_CLASS = tuple(MAP_CLASSES)[:-1], tuple(MAP_CLASSES)[-1]
 
 @dataclass(frozen=True)
 class SegmentationConfig:
-    """The segmentation head.
+    """The segmentation head."""
 
-    Attributes:
-        thing_queries: T, the largest number of vehicles.
-        location_layers: layers of the location decoder.
-        mask_layers: layers of the mask decoder.
-        attention_heads: heads of all attentions.
-        points: sampling points of a head in the location decoder.
-        feed_forward_width: channels between the two linear layers of a feed-forward network.
-        dropout: probability, 0 to below 1.
-        map_scale: cells of the panoptic map along a side of a BEV cell.
-        min_stuff: probability above which a cell of the map has a stuff class.
-        min_thing: probability above which a cell of the map belongs to a vehicle.
-    """
-
-    thing_queries: int = 60
-    location_layers: int = 2
-    mask_layers: int = 3
-    attention_heads: int = 8
-    points: int = 4
-    feed_forward_width: int = 512
-    dropout: float = 0.1
-    map_scale: int = 4
-    min_stuff: float = 0.45
-    min_thing: float = 0.2
+    thing_queries: int = 60  # T, the largest number of vehicles
+    location_layers: int = 2  # layers of the location decoder
+    mask_layers: int = 3  # layers of the mask decoder
+    attention_heads: int = 8  # heads of all attentions
+    points: int = 4  # sampling points of a head in the location decoder
+    feed_forward_width: int = 512  # channels between the two linear layers of a feed-forward network
+    dropout: float = 0.1  # probability, 0 to below 1
+    map_scale: int = 4  # cells of the panoptic map along a side of a BEV cell
+    min_stuff: float = 0.45  # probability above which a cell of the map has a stuff class
+    min_thing: float = 0.2  # probability above which a cell of the map belongs to a vehicle
 
     def __post_init__(self) -> None:
         if min(self.mask_layers, self.map_scale) < 1:
@@ -61,19 +48,13 @@ class SegmentationConfig:
 
 @dataclass(frozen=True)
 class SegmentationOutputs:
-    """Masks of Q queries: one for each of STUFF_CLASSES, in this order, then T thing queries.
+    """Masks of Q queries: one for each of STUFF_CLASSES, in this order, then T thing queries."""
 
-    Attributes:
-        mask_logits: (M, B, Q, Y·X) of the M mask layers; the index of a cell is row * columns + column.
-        class_logits: (M, B, Q), that anything of the query's class exists.
-        locations: (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the
-            map.
-        map_layers: see the function `map_layers`, for a batch of one; None where `decode_map` computes them.
-    """
-
-    mask_logits: Tensor
-    class_logits: Tensor
+    mask_logits: Tensor  # (M, B, Q, Y·X) of the M mask layers; the index of a cell is row * columns + column
+    class_logits: Tensor  # (M, B, Q), that anything of the query's class exists
+    # (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the map
     locations: Tensor
+    # see the function `map_layers`, for a batch of one; None where `decode_map` computes them
     map_layers: Tensor | None = None
 
     def last_layers(self) -> "SegmentationOutputs":

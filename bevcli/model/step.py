@@ -25,15 +25,10 @@ from bevcli.model.upload import upload
 
 @dataclass(frozen=True)
 class CameraAssignment:
-    """The cameras of a rig, assigned to the cameras that the model was trained with.
+    """The cameras of a rig, assigned to the cameras that the model was trained with."""
 
-    Attributes:
-        cameras: the rig's cameras in the model's order.
-        embeddings: for each of them, the model's camera whose embedding it takes.
-    """
-
-    cameras: tuple[str, ...]
-    embeddings: tuple[str, ...]
+    cameras: tuple[str, ...]  # the rig's cameras in the model's order
+    embeddings: tuple[str, ...]  # for each of them, the model's camera whose embedding it takes
 
 
 @dataclass(frozen=True)
@@ -66,28 +61,18 @@ class PreparedFrame:
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """One step of B sequences with N cameras.
+    """One step of B sequences with N cameras."""
 
-    Attributes:
-        images: (B, N, 3, H, W), normalised and padded.
-        image_from_bev: (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1).
-        camera_index: (N,) int64, the camera embedding of each image; (B, N) where the sequences differ.
-        has_image: (B, N) bool; a camera without an image sees no BEV cell.
-        image_sizes: (B, N, 2) float32, width and height of the images within their padding.
-        can_bus: (B, 18) float32, the translation and the change of heading since the previous frame included.
-        shift: (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history.
-        rotation_deg: (B,) float32, rotation of the history map.
-        expected_slopes: of the road, before the boxes of the frame are looked at; None where nothing is known.
-    """
-
-    images: Tensor
-    image_from_bev: Tensor
-    camera_index: Tensor
-    has_image: Tensor
-    image_sizes: Tensor
-    can_bus: Tensor
+    images: Tensor  # (B, N, 3, H, W), normalised and padded
+    image_from_bev: Tensor  # (B, N, 4, 4) float32, bev metres to pixels of the network's input (rows u·d, v·d, d, 1)
+    camera_index: Tensor  # (N,) int64, the camera embedding of each image; (B, N) where the sequences differ
+    has_image: Tensor  # (B, N) bool; a camera without an image sees no BEV cell
+    image_sizes: Tensor  # (B, N, 2) float32, width and height of the images within their padding
+    can_bus: Tensor  # (B, 18) float32, the translation and the change of heading since the previous frame included
+    # (B, 2) float32, translation of the history (x, y) in normalised BEV coordinates; zero without history
     shift: Tensor
-    rotation_deg: Tensor
+    rotation_deg: Tensor  # (B,) float32, rotation of the history map
+    # of the road, before the boxes of the frame are looked at; None where nothing is known
     expected_slopes: RoadSlopes | None = None
 
     @property

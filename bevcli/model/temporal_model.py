@@ -26,19 +26,12 @@ Renames = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
 
 @dataclass(frozen=True)
 class OfficialNames:
-    """The names of tensors in the released files of a model, beside those that all models share.
+    """The names of tensors in the released files of a model, beside those that all models share."""
 
-    Attributes:
-        mark: pattern of a key that only these files have; "" for a model with shared names only.
-        renames: pattern of the official name, and ours, in the order of use.
-        unused: pattern of the keys without effect at inference, which are left out.
-        unused_text: those in words, with their `count` and the `first` of them.
-    """
-
-    mark: str = ""
-    renames: Renames = ()
-    unused: str = ""
-    unused_text: str = "{count} keys, such as {first}"
+    mark: str = ""  # pattern of a key that only these files have; "" for a model with shared names only
+    renames: Renames = ()  # pattern of the official name, and ours, in the order of use
+    unused: str = ""  # pattern of the keys without effect at inference, which are left out
+    unused_text: str = "{count} keys, such as {first}"  # those in words, with their `count` and the `first` of them
 
     def without_unused(self, state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
         """The state dict without the unused keys, and these in words."""

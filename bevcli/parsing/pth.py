@@ -47,16 +47,12 @@ class Placeholder:
 
 @dataclass(frozen=True)
 class PthFile:
-    """The contents of a PyTorch file.
+    """The contents of a PyTorch file."""
 
-    Attributes:
-        contents: dicts, lists, tuples, plain values, `Placeholder`s, and tensors on the CPU that may be mapped from
-            the file: copy what must outlive it.
-        left_out: names of the classes and functions whose objects were left out, sorted.
-    """
-
+    # dicts, lists, tuples, plain values, `Placeholder`s, and tensors on the CPU that may be mapped from the file: copy
+    # what must outlive it
     contents: Any
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # names of the classes and functions whose objects were left out, sorted
 
 
 def read_pth(path: Path) -> PthFile:

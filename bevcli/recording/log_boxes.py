@@ -46,17 +46,11 @@ def detectable(ground_truth: Boxes3D, grid: BevGrid | None) -> Boxes3D:
 
 
 class Marks(NamedTuple):
-    """N predicted boxes against M ground-truth boxes.
+    """N predicted boxes against M ground-truth boxes."""
 
-    Attributes:
-        false: (N,) bool, the false positives: crossed out in red.
-        duplicate: (N,) bool, a second box on an object: one grey diagonal.
-        found: (M,) bool, the ground truth that a prediction matches.
-    """
-
-    false: NDArray[np.bool_]
-    duplicate: NDArray[np.bool_]
-    found: NDArray[np.bool_]
+    false: NDArray[np.bool_]  # (N,) bool, the false positives: crossed out in red
+    duplicate: NDArray[np.bool_]  # (N,) bool, a second box on an object: one grey diagonal
+    found: NDArray[np.bool_]  # (M,) bool, the ground truth that a prediction matches
 
 
 def false_and_duplicate(predictions: Boxes3D, ground_truth: Boxes3D | None) -> Marks:
@@ -307,19 +301,13 @@ def log_boxes_on_map(stream: rr.RecordingStream, origin: GeoOrigin, centers: Arr
 
 @dataclass
 class TrackHistory:
-    """The positions of each track on the ground, kept for PAST_S, and the entities that an interrupted recording needs.
+    """The positions of each track on the ground, kept for PAST_S, and the entities that an interrupted run needs."""
 
-    Attributes:
-        scene: the scene of the last frame; a new scene has new tracks.
-        times_ns: by track, the times of its positions.
-        positions: by track, positions (3,) in the recording's world, the oldest first.
-        shown: the entities that show a track now, sorted.
-    """
-
-    scene: str = ""
-    times_ns: dict[str, list[int]] = field(default_factory=dict)
+    scene: str = ""  # the scene of the last frame; a new scene has new tracks
+    times_ns: dict[str, list[int]] = field(default_factory=dict)  # by track, the times of its positions
+    # by track, positions (3,) in the recording's world, the oldest first
     positions: dict[str, list[Array]] = field(default_factory=dict)
-    shown: list[str] = field(default_factory=list)
+    shown: list[str] = field(default_factory=list)  # the entities that show a track now, sorted
 
     def add(self, identities: list[str], feet: Array, stamp: FrameStamp) -> None:
         """Add the positions of T tracks, and forget what is too old. feet: (T, 3), in the recording's world."""

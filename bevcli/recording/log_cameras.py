@@ -35,50 +35,31 @@ NO_COLORS = np.zeros((0, 3), np.uint8)
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A camera with its pose at the time of its image.
+    """A camera with its pose at the time of its image."""
 
-    Attributes:
-        camera: name, intrinsics and distortion.
-        world_from_camera: (4, 4) into the recording's world.
-        camera_from_world: (4, 4), its inverse.
-    """
-
-    camera: Camera
-    world_from_camera: Array
-    camera_from_world: Array
+    camera: Camera  # name, intrinsics and distortion
+    world_from_camera: Array  # (4, 4) into the recording's world
+    camera_from_world: Array  # (4, 4), its inverse
 
 
 @dataclass(frozen=True)
 class ImageLayer:
-    """Boxes that are drawn into the images.
+    """Boxes that are drawn into the images."""
 
-    Attributes:
-        kind: of their overlay, see `bevcli.recording.entities.overlay`.
-        corners: (N, 8, 3) in the recording's world.
-        colors: (N, 3) uint8.
-        texts: N labels; None for none.
-        width: of the lines, in points of the user interface.
-        order: boxes with a higher one are drawn above others.
-    """
-
-    kind: str
-    corners: Array
-    colors: NDArray[np.uint8]
-    texts: list[str] | None = None
-    width: float = 1.0
-    order: int = 30
+    kind: str  # of their overlay, see `bevcli.recording.entities.overlay`
+    corners: Array  # (N, 8, 3) in the recording's world
+    colors: NDArray[np.uint8]  # (N, 3) uint8
+    texts: list[str] | None = None  # N labels; None for none
+    width: float = 1.0  # of the lines, in points of the user interface
+    order: int = 30  # boxes with a higher one are drawn above others
 
 
 @dataclass(frozen=True)
 class ImageLines:
-    """Lines in an image.
+    """Lines in an image."""
 
-    Attributes:
-        segments: (M, 2, 2) start and end of each line, pixels, inside the image.
-        owners: (M,) the index of the box that each line belongs to; the lines of a box follow each other.
-    """
-
-    segments: Array
+    segments: Array  # (M, 2, 2) start and end of each line, pixels, inside the image
+    # (M,) the index of the box that each line belongs to; the lines of a box follow each other
     owners: NDArray[np.int64]
 
 
@@ -216,16 +197,11 @@ def transform(parent_from_entity: Array) -> Components:
 
 @dataclass
 class CameraImages:
-    """Writes the images of all cameras.
-
-    Attributes:
-        as_video: AV1, in place of the bytes of the image files.
-        without: the cameras whose last frame had no image.
-    """
+    """Writes the images of all cameras."""
 
     stream: rr.RecordingStream
-    as_video: bool
-    without: list[str]
+    as_video: bool  # AV1, in place of the bytes of the image files
+    without: list[str]  # the cameras whose last frame had no image
     encoders: "dict[str, Av1Encoder]" = field(default_factory=dict)
 
     def log(self, camera: Camera, image: CameraImage | None) -> None:

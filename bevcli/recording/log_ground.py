@@ -33,19 +33,12 @@ ABOVE_GROUND = (0, 0, 0.04)  # metres, so that lines do not flicker with what li
 
 @dataclass(frozen=True)
 class BevColors:
-    """A fixed mapping from features to colours.
+    """A fixed mapping from features to colours."""
 
-    Attributes:
-        mean: (C,) subtracted from the features.
-        basis: (C, K) projection, K 1 or 3; None takes the norm of the features (K 1).
-        low: (K,) values that become 0.
-        high: (K,) values that become 1.
-    """
-
-    mean: Features
-    basis: Features | None
-    low: Array
-    high: Array
+    mean: Features  # (C,) subtracted from the features
+    basis: Features | None  # (C, K) projection, K 1 or 3; None takes the norm of the features (K 1)
+    low: Array  # (K,) values that become 0
+    high: Array  # (K,) values that become 1
 
     def paint(self, features: Features) -> NDArray[np.uint8]:
         """Features (..., C) -> (..., 3) uint8 RGB."""
@@ -82,16 +75,12 @@ def fit_colors(kind: str, features: Features) -> BevColors:
 
 @dataclass
 class BevImages:
-    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame.
+    """Takes the features of each frame; returns the images that are ready, each with the stamp of its frame."""
 
-    Attributes:
-        kind: see `fit_colors`.
-        colors: fitted on the first frames, None before. Setting them continues an interrupted recording.
-        waiting: stamps and features of the frames whose images are not returned yet.
-    """
-
-    kind: str
+    kind: str  # see `fit_colors`
+    # fitted on the first frames, None before. Setting them continues an interrupted recording
     colors: BevColors | None = None
+    # stamps and features of the frames whose images are not returned yet
     waiting: list[tuple[Any, Features]] = field(default_factory=list)
 
     def push(self, stamp: Any, features: Features) -> list[tuple[Any, NDArray[np.uint8]]]:

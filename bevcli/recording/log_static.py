@@ -86,21 +86,14 @@ class RecordedModel(Protocol):
 
 @dataclass(frozen=True)
 class RecordedBoxes:
-    """Boxes that are recorded in place of a model's: those of one file against the labels, of two files, or labels.
+    """Boxes that are recorded in place of a model's: those of one file against the labels, of two files, or labels."""
 
-    Attributes:
-        names: of the files, at most two; none for labels alone.
-        classes: by name, which are scored.
-        ranges_m: by class, the distance from the ego vehicle below which misses and false positives are marked.
-        untrained: whether random weights made the boxes.
-        map_classes: of the map that is part of the labels.
-    """
-
-    names: tuple[str, ...] = ()
-    classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)
+    names: tuple[str, ...] = ()  # of the files, at most two; none for labels alone
+    classes: Mapping[str, ObjectClass] = field(default_factory=lambda: NUSCENES_CLASSES)  # by name, which are scored
+    # by class, the distance from the ego vehicle below which misses and false positives are marked
     ranges_m: Mapping[str, float] = field(default_factory=dict)
-    untrained: bool = False
-    map_classes: tuple[str, ...] = ()
+    untrained: bool = False  # whether random weights made the boxes
+    map_classes: tuple[str, ...] = ()  # of the map that is part of the labels
 
 
 class RecordedDrive(Protocol):

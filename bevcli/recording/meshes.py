@@ -42,31 +42,20 @@ FRONT_ARROW = np.array([[2.2, -0.8], [3.3, 0.0], [2.2, 0.8]])
 
 
 class Mesh(NamedTuple):
-    """Triangles with colours.
+    """Triangles with colours."""
 
-    Attributes:
-        vertices: (V, 3) metres.
-        normals: (V, 3) unit vectors.
-        faces: (F, 3) vertex indices.
-        colors: (V, 3) uint8 RGB.
-    """
-
-    vertices: Array
-    normals: Array
-    faces: NDArray[np.int64]
-    colors: NDArray[np.uint8]
+    vertices: Array  # (V, 3) metres
+    normals: Array  # (V, 3) unit vectors
+    faces: NDArray[np.int64]  # (F, 3) vertex indices
+    colors: NDArray[np.uint8]  # (V, 3) uint8 RGB
 
 
 @dataclass(frozen=True)
 class VehicleMesh:
-    """The ego vehicle in the ego frame.
+    """The ego vehicle in the ego frame."""
 
-    Attributes:
-        mesh: its triangles.
-        top_view: line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # its triangles
+    # line strips (K, 2), metres: the vehicle from above, its outline and an arrow at its front
     top_view: tuple[Array, ...]
 
 

@@ -64,44 +64,27 @@ class LiveSink(Protocol):
 
 @dataclass
 class RecordingState:
-    """What the frames so far leave behind for later ones, also for those of a resumed run.
+    """What the frames so far leave behind for later ones, also for those of a resumed run."""
 
-    Attributes:
-        recording_id: rerun's id of the recording.
-        size: bytes of the file after the last frame.
-        origin: (3,) the recording's origin in the sequence's world, metres: the place of the first frame's ego vehicle.
-        scene: of the last frame.
-        world_from_ego: pose of the last frame in the sequence's world; None before the first one.
-        colors: of the BEV features, None where these are not drawn.
-        tracks: the trails.
-        without_image: cameras that had no image in the last frame.
-        has_truth: the last frame had ground truth.
-    """
-
-    recording_id: str
-    size: int = 0
+    recording_id: str  # rerun's id of the recording
+    size: int = 0  # bytes of the file after the last frame
+    # (3,) the recording's origin in the sequence's world, metres: the place of the first frame's ego vehicle
     origin: Array | None = None
-    scene: str = ""
-    world_from_ego: Pose | None = None
-    colors: BevColors | None = None
-    tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)
-    without_image: list[str] = field(default_factory=list)
-    has_truth: bool = False
+    scene: str = ""  # of the last frame
+    world_from_ego: Pose | None = None  # pose of the last frame in the sequence's world; None before the first one
+    colors: BevColors | None = None  # of the BEV features, None where these are not drawn
+    tracks: log_boxes.TrackHistory = field(default_factory=log_boxes.TrackHistory)  # the trails
+    without_image: list[str] = field(default_factory=list)  # cameras that had no image in the last frame
+    has_truth: bool = False  # the last frame had ground truth
 
 
 @dataclass(frozen=True)
 class _Poses:
-    """The frames of reference of one frame's boxes.
+    """The frames of reference of one frame's boxes."""
 
-    Attributes:
-        moved: (4, 4) from the sequence's world into the recording's world.
-        pose: of the vehicle in the sequence's world.
-        ego_from_bev: (4, 4).
-    """
-
-    moved: Array
-    pose: Pose
-    ego_from_bev: Array
+    moved: Array  # (4, 4) from the sequence's world into the recording's world
+    pose: Pose  # of the vehicle in the sequence's world
+    ego_from_bev: Array  # (4, 4)
 
     @cached_property
     def world_from_bev(self) -> Array:

@@ -47,22 +47,14 @@ INDENT = " " * 10
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """The result of `check_calibration`.
+    """The result of `check_calibration`."""
 
-    Attributes:
-        name: of the calibration file or the sequence.
-        rig: the cameras that could be read.
-        findings: errors first, then warnings, then infos.
-        coverage: how many cameras see each cell of the BEV grid.
-        measures: the rig next to nuScenes'; empty where errors make the comparison meaningless.
-        images: by camera, (H, W, 3) uint8 BGR, of the chosen frame; empty without a sequence.
-    """
-
-    name: str
-    rig: CameraRig
-    findings: tuple[Finding, ...]
-    coverage: Coverage
-    measures: tuple[Measure, ...]
+    name: str  # of the calibration file or the sequence
+    rig: CameraRig  # the cameras that could be read
+    findings: tuple[Finding, ...]  # errors first, then warnings, then infos
+    coverage: Coverage  # how many cameras see each cell of the BEV grid
+    measures: tuple[Measure, ...]  # the rig next to nuScenes'; empty where errors make the comparison meaningless
+    # by camera, (H, W, 3) uint8 BGR, of the chosen frame; empty without a sequence
     images: Mapping[str, NDArray[np.uint8]]
 
     @property

@@ -19,17 +19,11 @@ ADVICE = "expect worse results with published weights, or train on this rig"
 
 @dataclass(frozen=True)
 class Coverage:
-    """The cells of a BEV grid that the cameras see.
+    """The cells of a BEV grid that the cameras see."""
 
-    Attributes:
-        grid: the BEV grid.
-        counts: (rows, columns), the number of cameras that see at least one point of the cell's pillar.
-        shares: by camera, the share of all cells that it sees, 0 to 1.
-    """
-
-    grid: BevGrid
-    counts: NDArray[np.int64]
-    shares: Mapping[str, float]
+    grid: BevGrid  # the BEV grid
+    counts: NDArray[np.int64]  # (rows, columns), the number of cameras that see at least one point of the cell's pillar
+    shares: Mapping[str, float]  # by camera, the share of all cells that it sees, 0 to 1
 
     @property
     def unseen(self) -> float:

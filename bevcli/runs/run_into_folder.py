@@ -261,17 +261,11 @@ def _save_bev(folder: Path, prediction: Prediction, model: Model) -> None:
 
 @dataclass(frozen=True)
 class FolderRun:
-    """A run into a folder.
+    """A run into a folder."""
 
-    Attributes:
-        frames: each frame with its prediction, once it is in the files.
-        done: number of frames that an interrupted run had finished.
-        summary: counts and times so far.
-    """
-
-    frames: Iterator[tuple[Frame, Prediction]]
-    done: int
-    summary: RunSummary
+    frames: Iterator[tuple[Frame, Prediction]]  # each frame with its prediction, once it is in the files
+    done: int  # number of frames that an interrupted run had finished
+    summary: RunSummary  # counts and times so far
 
 
 def run_into_folder(

@@ -184,35 +184,22 @@ State = TypeVar("State", bound=_HasFingerprint)
 
 @dataclass(frozen=True)
 class FilesState:
-    """Sizes and states with which the files of an interrupted run go on.
+    """Sizes and states with which the files of an interrupted run go on."""
 
-    Attributes:
-        recording: of recording.rrd.
-        sizes: name -> bytes of each other file that grows.
-        map_frames: indices of the frames that have a map.
-        bev_frames: indices of the frames that have BEV features.
-    """
-
-    recording: RecordingState
-    sizes: dict[str, int]
-    map_frames: list[int]
-    bev_frames: list[int]
+    recording: RecordingState  # of recording.rrd
+    sizes: dict[str, int]  # name -> bytes of each other file that grows
+    map_frames: list[int]  # indices of the frames that have a map
+    bev_frames: list[int]  # indices of the frames that have BEV features
 
 
 @dataclass(frozen=True)
 class RunState(Generic[Memory]):
-    """A run after a number of finished frames.
+    """A run after a number of finished frames."""
 
-    Attributes:
-        fingerprint: of the run, see `run_fingerprint`.
-        files: None as long as nothing can be kept; the run then starts anew.
-        counts: of the summary so far.
-        runner: what the next frame needs; nothing before the first frame and after the last one.
-    """
-
-    fingerprint: dict[str, str]
-    files: FilesState | None
-    counts: Counts
+    fingerprint: dict[str, str]  # of the run, see `run_fingerprint`
+    files: FilesState | None  # None as long as nothing can be kept; the run then starts anew
+    counts: Counts  # of the summary so far
+    # what the next frame needs; nothing before the first frame and after the last one
     runner: RunnerState[Memory] = field(default_factory=RunnerState)
 
 

@@ -22,16 +22,11 @@ RATIO = 1.01  # of two neighbouring bins of a `RunningMedian`
 
 @dataclass
 class RunningMedian:
-    """A histogram with logarithmic bins. Its median is at most 0.5 % wrong.
+    """A histogram with logarithmic bins. Its median is at most 0.5 % wrong."""
 
-    Attributes:
-        count: number of values.
-        total_s: their sum, seconds.
-        bins: index of a bin -> number of values in it; a bin is at RATIO ** index seconds.
-    """
-
-    count: int = 0
-    total_s: float = 0.0
+    count: int = 0  # number of values
+    total_s: float = 0.0  # their sum, seconds
+    # index of a bin -> number of values in it; a bin is at RATIO ** index seconds
     bins: dict[int, int] = field(default_factory=dict)
 
     def add(self, seconds: float) -> None:
@@ -53,33 +48,20 @@ class RunningMedian:
 
 @dataclass
 class Counts:
-    """Counts and times of a run so far. A resumed run goes on from them.
+    """Counts and times of a run so far. A resumed run goes on from them."""
 
-    Attributes:
-        seconds: by stage.
-        whole: of whole frames.
-        boxes: class -> number of boxes.
-        unseen: number of boxes that were left out, because no camera looks there.
-        tracks: identity -> class; None without tracks.
-        dropped: (frame, camera, reason) of each missing image.
-        skipped: frames without any image.
-        not_finite: (frame, where) of frames whose numbers stopped being finite.
-        started_anew: (frame, reason) of frames without history.
-        embeddings: camera of the rig -> camera of the model.
-        flat: camera -> number of images that are nearly black or white.
-    """
-
-    seconds: dict[str, RunningMedian] = field(default_factory=dict)
-    whole: RunningMedian = field(default_factory=RunningMedian)
-    boxes: dict[str, int] = field(default_factory=dict)
-    unseen: int = 0
-    tracks: dict[str, str] | None = None
-    dropped: list[tuple[int, str, str]] = field(default_factory=list)
-    skipped: list[int] = field(default_factory=list)
+    seconds: dict[str, RunningMedian] = field(default_factory=dict)  # by stage
+    whole: RunningMedian = field(default_factory=RunningMedian)  # of whole frames
+    boxes: dict[str, int] = field(default_factory=dict)  # class -> number of boxes
+    unseen: int = 0  # number of boxes that were left out, because no camera looks there
+    tracks: dict[str, str] | None = None  # identity -> class; None without tracks
+    dropped: list[tuple[int, str, str]] = field(default_factory=list)  # (frame, camera, reason) of each missing image
+    skipped: list[int] = field(default_factory=list)  # frames without any image
+    # (frame, where) of frames whose numbers stopped being finite
     not_finite: list[tuple[int, str]] = field(default_factory=list)
-    started_anew: list[tuple[int, str]] = field(default_factory=list)
-    embeddings: dict[str, str] = field(default_factory=dict)
-    flat: dict[str, int] = field(default_factory=dict)
+    started_anew: list[tuple[int, str]] = field(default_factory=list)  # (frame, reason) of frames without history
+    embeddings: dict[str, str] = field(default_factory=dict)  # camera of the rig -> camera of the model
+    flat: dict[str, int] = field(default_factory=dict)  # camera -> number of images that are nearly black or white
 
 
 class RunSummary:

@@ -142,17 +142,11 @@ AT_REST = Kinematics(np.array([0.0, 0.0, GRAVITY]), np.zeros(3), np.zeros(3))
 
 @dataclass(frozen=True)
 class ImageSource:
-    """The place and the time of one image.
+    """The place and the time of one image."""
 
-    Attributes:
-        path: an image file or a video.
-        timestamp_ns: time of the image.
-        video_index: index of the image in the video, from 0. None for an image file.
-    """
-
-    path: Path
-    timestamp_ns: int
-    video_index: int | None = None
+    path: Path  # an image file or a video
+    timestamp_ns: int  # time of the image
+    video_index: int | None = None  # index of the image in the video, from 0. None for an image file
 
     def __str__(self) -> str:
         return str(self.path) if self.video_index is None else f"{self.path}#{self.video_index}"
@@ -170,17 +164,11 @@ class UnreadableImage(Exception):
 
 @dataclass(frozen=True)
 class MessageSource:
-    """One image of another format, which reads itself.
+    """One image of another format, which reads itself."""
 
-    Attributes:
-        name: of the file and the image in it, for messages.
-        timestamp_ns: time of the image, at least roughly.
-        read: reads the image; may be called from several threads. Raises UnreadableImage.
-    """
-
-    name: str
-    timestamp_ns: int
-    read: Callable[[], CameraImage]
+    name: str  # of the file and the image in it, for messages
+    timestamp_ns: int  # time of the image, at least roughly
+    read: Callable[[], CameraImage]  # reads the image; may be called from several threads. Raises UnreadableImage
 
     def __str__(self) -> str:
         return self.name
@@ -296,19 +284,12 @@ class ImageReader:
 
 @dataclass(frozen=True)
 class FrameEntry:
-    """One frame before its images are read. Each camera is in `sources` or in `dropped`.
+    """One frame before its images are read. Each camera is in `sources` or in `dropped`."""
 
-    Attributes:
-        stamp: index, scene and time of the frame.
-        sources: location of the image, by camera.
-        dropped: reason why there is no image, by camera.
-        origin: where the frame is listed, such as "frames.csv: line 3", for error messages.
-    """
-
-    stamp: FrameStamp
-    sources: Mapping[str, Source]
-    dropped: Mapping[str, str]
-    origin: str
+    stamp: FrameStamp  # index, scene and time of the frame
+    sources: Mapping[str, Source]  # location of the image, by camera
+    dropped: Mapping[str, str]  # reason why there is no image, by camera
+    origin: str  # where the frame is listed, such as "frames.csv: line 3", for error messages
 
     @property
     def times_ns(self) -> list[int]:

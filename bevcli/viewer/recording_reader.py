@@ -35,17 +35,11 @@ SHOWN_ENTITIES = 15
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """The state of all entities at one frame. What is read is checked: InputError for other types and lengths.
+    """The state of all entities at one frame. What is read is checked: InputError for other types and lengths."""
 
-    Attributes:
-        index: the frame's index.
-        rows: by entity, then by component: the newest value, static ones included.
-        path: the recording's file, for messages.
-    """
-
-    index: int
-    rows: Mapping[str, Row]
-    path: Path
+    index: int  # the frame's index
+    rows: Mapping[str, Row]  # by entity, then by component: the newest value, static ones included
+    path: Path  # the recording's file, for messages
 
     def has(self, entity: str, component: str) -> bool:
         """True if the entity has a value for this component."""

@@ -47,17 +47,12 @@ CONTENT_RANGE = re.compile(r"bytes (\d{1,15})-(\d{1,15})/(\d{1,15})")
 
 @dataclass(frozen=True)
 class FetchedWeights:
-    """A file of weights that was checked.
+    """A file of weights that was checked."""
 
-    Attributes:
-        path: the file.
-        known: its hash and size.
-        checked: how much of its hash was known before: "all", "the first N digits", "as at its first download", or
-            "nothing", where only size, keys and shapes were.
-    """
-
-    path: Path
-    known: Known
+    path: Path  # the file
+    known: Known  # its hash and size
+    # how much of its hash was known before: "all", "the first N digits", "as at its first download", or "nothing",
+    # where only size, keys and shapes were
     checked: str
 
 

@@ -20,49 +20,33 @@ from bevcli.model.upload import on_device, upload, upload_together
 
 @dataclass(frozen=True)
 class BevHistory:
-    """The last BEV map, which the next frame attends to.
+    """The last BEV map, which the next frame attends to."""
 
-    Attributes:
-        bev: (1, Y·X, C), the BEV map of the last frame.
-        pose: world_from_ego of that frame.
-        road: for a model that levels the rig of each frame.
-    """
-
-    bev: Tensor
-    pose: Pose
-    road: RoadMemory | None = None
+    bev: Tensor  # (1, Y·X, C), the BEV map of the last frame
+    pose: Pose  # world_from_ego of that frame
+    road: RoadMemory | None = None  # for a model that levels the rig of each frame
 
 
 @dataclass(frozen=True)
 class EncoderInputs:
-    """All that the device part of a step reads, on the device or, small tensors, on the CPU.
+    """All that the device part of a step reads, on the device or, small tensors, on the CPU."""
 
-    Attributes:
-        images: see `ModelInputs`, as for image_from_bev, camera_index, has_image, image_sizes, can_bus and shift.
-        image_from_level: (B, N, 4, 4), as image_from_bev, of the rig as the boxes in the images level it; hits and rays
-            are of this rig.
-        image_boxes: of a detector beside the backbone, None without one.
-        expected_slopes: see `ModelInputs`.
-        hits: the cells that each camera sees.
-        rays: scale and shift of the image features, of the calibration embedding; None without one.
-        history: (B, Y·X, C), the BEV map of the previous frame; None without history.
-        rotation: (B, 2, 3), of the history, see `map_rotation`; None without history.
-    """
-
-    images: Tensor
+    images: Tensor  # see `ModelInputs`, as for image_from_bev, camera_index, has_image, image_sizes, can_bus and shift
     image_from_bev: Tensor
+    # (B, N, 4, 4), as image_from_bev, of the rig as the boxes in the images level it; hits and rays are of this rig
     image_from_level: Tensor
     camera_index: Tensor
     has_image: Tensor
     image_sizes: Tensor
     can_bus: Tensor
     shift: Tensor
-    hits: PillarHits
+    hits: PillarHits  # the cells that each camera sees
+    # scale and shift of the image features, of the calibration embedding; None without one
     rays: tuple[Tensor, Tensor] | None
-    history: Tensor | None
-    rotation: Tensor | None
-    image_boxes: ImageBoxes | None = None
-    expected_slopes: RoadSlopes | None = None
+    history: Tensor | None  # (B, Y·X, C), the BEV map of the previous frame; None without history
+    rotation: Tensor | None  # (B, 2, 3), of the history, see `map_rotation`; None without history
+    image_boxes: ImageBoxes | None = None  # of a detector beside the backbone, None without one
+    expected_slopes: RoadSlopes | None = None  # see `ModelInputs`
 
 
 class BEVFormer(Network):

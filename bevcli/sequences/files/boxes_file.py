@@ -290,37 +290,26 @@ def _futures(rows: Sequence[Any], location: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class FrameBoxes:
-    """One frame's boxes, in the frame of reference of its file.
+    """One frame's boxes, in the frame of reference of its file."""
 
-    Attributes:
-        stamp: index, scene and time of the frame.
-        world_from_ego: pose at the frame's time. None if unknown, which is not allowed in a file in the world frame.
-        boxes: N boxes, metres.
-        extras: further members of the frame's JSON object, such as "skipped" or "sample_token".
-    """
-
-    stamp: FrameStamp
+    stamp: FrameStamp  # index, scene and time of the frame
+    # pose at the frame's time. None if unknown, which is not allowed in a file in the world frame
     world_from_ego: Pose | None
-    boxes: Boxes3D
+    boxes: Boxes3D  # N boxes, metres
+    # further members of the frame's JSON object, such as "skipped" or "sample_token"
     extras: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class BoxesFile:
-    """All frames of a file, in its order.
+    """All frames of a file, in its order."""
 
-    Attributes:
-        frame_of_reference: "world", "ego" or "bev"; all centres, yaws and velocities are in it.
-        frames: the frames.
-        ego_from_bev: pose of the bev frame, None if unknown.
-        extras: further members of the file's JSON object, such as "model" or "untrained".
-        classes: the classes of the model that predicted the boxes; None where the file does not state them.
-    """
-
-    frame_of_reference: str
-    frames: tuple[FrameBoxes, ...]
-    ego_from_bev: Pose | None = None
+    frame_of_reference: str  # "world", "ego" or "bev"; all centres, yaws and velocities are in it
+    frames: tuple[FrameBoxes, ...]  # the frames
+    ego_from_bev: Pose | None = None  # pose of the bev frame, None if unknown
+    # further members of the file's JSON object, such as "model" or "untrained"
     extras: Mapping[str, Any] = field(default_factory=dict)
+    # the classes of the model that predicted the boxes; None where the file does not state them
     classes: Mapping[str, ObjectClass] | None = None
 
     def in_ego(self, frame: FrameBoxes) -> Boxes3D:

@@ -45,24 +45,17 @@ COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 @dataclass(frozen=True)
 class RigDraft:
-    """A calibration with mistakes.
+    """A calibration with mistakes."""
 
-    Attributes:
-        rig: the cameras with usable fields, possibly none. Invalid rotations are replaced by the nearest valid ones.
-        findings: what is wrong with the file. Whether its numbers are plausible is checked in `bevcli.rig`.
-        facts: what the file states about the drive.
-        readings: what the poses in a file of another program may be, the rig being the first; empty where they are
-            certain.
-        others: readings that contradict what the user states.
-        file: of the poses.
-    """
-
+    # the cameras with usable fields, possibly none. Invalid rotations are replaced by the nearest valid ones
     rig: CameraRig
+    # what is wrong with the file. Whether its numbers are plausible is checked in `bevcli.rig`
     findings: tuple[Finding, ...]
-    facts: DriveFacts = field(default_factory=DriveFacts)
+    facts: DriveFacts = field(default_factory=DriveFacts)  # what the file states about the drive
+    # what the poses in a file of another program may be, the rig being the first; empty where they are certain
     readings: tuple[RigReading, ...] = ()
-    others: tuple[RigReading, ...] = ()
-    file: Path = Path()
+    others: tuple[RigReading, ...] = ()  # readings that contradict what the user states
+    file: Path = Path()  # of the poses
 
     @property
     def notes(self) -> tuple[str, ...]:

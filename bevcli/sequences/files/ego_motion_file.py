@@ -35,19 +35,12 @@ class FrameTimesNeeded(InputError):
 
 @dataclass(frozen=True)
 class DrivePoses:
-    """The drive that a file of poses is for, and what the user states of the file.
+    """The drive that a file of poses is for, and what the user states of the file."""
 
-    Attributes:
-        rig: of the drive.
-        stated: `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found.
-        times_ns: (F,) of its frames; None while they are not known.
-        rig_is_open: the poses of its cameras are one of several readings.
-    """
-
-    rig: CameraRig
-    stated: RigOptions
-    times_ns: NDArray[np.int64] | None = None
-    rig_is_open: bool = False
+    rig: CameraRig  # of the drive
+    stated: RigOptions  # `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found
+    times_ns: NDArray[np.int64] | None = None  # (F,) of its frames; None while they are not known
+    rig_is_open: bool = False  # the poses of its cameras are one of several readings
 
     @property
     def cameras_ahead(self) -> list[Camera]:
@@ -57,23 +50,15 @@ class DrivePoses:
 
 @dataclass(frozen=True)
 class ReadPoses:
-    """The poses of a file.
+    """The poses of a file."""
 
-    Attributes:
-        motion: None without poses.
-        notes: for the user, such as how the file was read.
-        geo_origin: the place of their world frame on Earth, where the file says it.
-        readings: what the poses of another program may be, the motion being the first; empty where they are certain.
-        others: readings that contradict what the user states.
-        file: of the poses.
-    """
-
-    motion: EgoMotion | None
-    notes: tuple[str, ...] = ()
-    geo_origin: GeoOrigin | None = None
+    motion: EgoMotion | None  # None without poses
+    notes: tuple[str, ...] = ()  # for the user, such as how the file was read
+    geo_origin: GeoOrigin | None = None  # the place of their world frame on Earth, where the file says it
+    # what the poses of another program may be, the motion being the first; empty where they are certain
     readings: tuple[PoseReading, ...] = ()
-    others: tuple[PoseReading, ...] = ()
-    file: Path = Path()
+    others: tuple[PoseReading, ...] = ()  # readings that contradict what the user states
+    file: Path = Path()  # of the poses
 
 
 def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:

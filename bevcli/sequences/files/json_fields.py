@@ -19,16 +19,11 @@ _Value = TypeVar("_Value")
 
 @dataclass(frozen=True)
 class Report:
-    """Collects findings while a file is read. A function that reads a value returns None for one that cannot be used.
+    """Collects findings while a file is read. A function that reads a value returns None for an unusable one."""
 
-    Attributes:
-        camera: the camera that the fields belong to, None for the whole file.
-        prefix: path of the enclosing keys, such as "ego_from_camera.".
-        findings: the findings so far; copies made by `replace` share the list.
-    """
-
-    camera: str | None = None
-    prefix: str = ""
+    camera: str | None = None  # the camera that the fields belong to, None for the whole file
+    prefix: str = ""  # path of the enclosing keys, such as "ego_from_camera."
+    # the findings so far; copies made by `replace` share the list
     findings: list[Finding] = field(default_factory=list)
 
     def error(

@@ -43,14 +43,10 @@ def is_left_handed(letters: str) -> bool:
 
 @dataclass(frozen=True)
 class Reading:
-    """One of the things that a file may mean.
+    """One of the things that a file may mean."""
 
-    Attributes:
-        states: the options that state it, and their values, such as {"rig_axes": "rfu"}.
-        rank: 0 for a usual one; one of a higher rank is believed only where it fits much better.
-    """
-
-    states: Mapping[str, str]
+    states: Mapping[str, str]  # the options that state it, and their values, such as {"rig_axes": "rfu"}
+    # 0 for a usual one; one of a higher rank is believed only where it fits much better
     rank: int = field(default=0, kw_only=True)
 
     def words(self, names: Sequence[str] = ()) -> str:
@@ -72,19 +68,12 @@ class RigReading(Reading):
 
 @dataclass(frozen=True)
 class PoseReading(Reading):
-    """T poses world_from_ego, or those of a camera.
+    """T poses world_from_ego, or those of a camera."""
 
-    Attributes:
-        translations: (T, 3) metres.
-        quaternions: (T, 4) w, x, y, z, norm 1.
-        camera: whose poses they are, with optical axes; "" for the vehicle.
-        note: how the file was read, in words.
-    """
-
-    translations: Array
-    quaternions: Array
-    camera: str = ""
-    note: str = ""
+    translations: Array  # (T, 3) metres
+    quaternions: Array  # (T, 4) w, x, y, z, norm 1
+    camera: str = ""  # whose poses they are, with optical axes; "" for the vehicle
+    note: str = ""  # how the file was read, in words
 
 
 def _word(name: str, value: str) -> str:

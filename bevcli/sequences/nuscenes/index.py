@@ -51,21 +51,14 @@ NEAR_US = 60_000
 
 @dataclass(frozen=True)
 class Dialect:
-    """The reading of tables that differ from nuScenes' own in some points.
+    """The reading of tables that differ from nuScenes' own in some points."""
 
-    Attributes:
-        lidars: channels of which each sample should have a keyframe, whose ego pose is that of the frame.
-        class_of: a category -> its class, None for a category that is left out.
-        visibilities: names of visibility levels -> visible fraction, besides names such as "v40-60".
-        has_attributes: whether the attributes are those of nuScenes, which are scored.
-        bev_is_lidar: whether the bev frame is that of the lidar.
-    """
-
-    lidars: tuple[str, ...]
-    class_of: Callable[[str], str | None]
+    lidars: tuple[str, ...]  # channels of which each sample should have a keyframe, whose ego pose is that of the frame
+    class_of: Callable[[str], str | None]  # a category -> its class, None for a category that is left out
+    # names of visibility levels -> visible fraction, besides names such as "v40-60"
     visibilities: Mapping[str, float] = field(default_factory=dict)
-    has_attributes: bool = True
-    bev_is_lidar: bool = True
+    has_attributes: bool = True  # whether the attributes are those of nuScenes, which are scored
+    bev_is_lidar: bool = True  # whether the bev frame is that of the lidar
 
 
 # The published models predict in the frame of LIDAR_TOP.
@@ -152,29 +145,18 @@ class Images:
 
 @dataclass(frozen=True)
 class Annotations:
-    """A annotated boxes in the world frame, ordered by sample.
+    """A annotated boxes in the world frame, ordered by sample."""
 
-    Attributes:
-        categories: (A,) nuScenes' category names; "" for a box that refers to a missing instance and is left out.
-        attributes: (A,) attribute names, "" for none.
-        instances: (A,) tokens of the objects.
-        centers: (A, 3) metres.
-        sizes_wlh: (A, 3) width, length, height, metres.
-        quaternions: (A, 4) w, x, y, z.
-        velocities: (A, 2) m/s along x and y; NaN if unknown.
-        visibilities: (A,) 0 to 1; NaN if unknown.
-        num_points: (A,) number of lidar and radar points, -1 if unknown.
-    """
-
+    # (A,) nuScenes' category names; "" for a box that refers to a missing instance and is left out
     categories: NDArray[np.bytes_]
-    attributes: NDArray[np.bytes_]
-    instances: NDArray[np.bytes_]
-    centers: Array
-    sizes_wlh: Array
-    quaternions: Array
-    velocities: Array
-    visibilities: Array
-    num_points: Ints
+    attributes: NDArray[np.bytes_]  # (A,) attribute names, "" for none
+    instances: NDArray[np.bytes_]  # (A,) tokens of the objects
+    centers: Array  # (A, 3) metres
+    sizes_wlh: Array  # (A, 3) width, length, height, metres
+    quaternions: Array  # (A, 4) w, x, y, z
+    velocities: Array  # (A, 2) m/s along x and y; NaN if unknown
+    visibilities: Array  # (A,) 0 to 1; NaN if unknown
+    num_points: Ints  # (A,) number of lidar and radar points, -1 if unknown
 
 
 @dataclass(frozen=True)

@@ -41,19 +41,12 @@ CAMERAS = tuple(NUSCENES_YAWS_DEG)
 
 @dataclass(frozen=True)
 class CanBus:
-    """The T pose messages of a scene in the CAN bus expansion.
+    """The T pose messages of a scene in the CAN bus expansion."""
 
-    Attributes:
-        times_us: (T,) microseconds, increasing.
-        accelerations: (T, 3) m/s² with gravity, ego frame.
-        angular_rates: (T, 3) rad/s, ego frame.
-        velocities: (T, 3) m/s, ego frame.
-    """
-
-    times_us: NDArray[np.int64]
-    accelerations: Array
-    angular_rates: Array
-    velocities: Array
+    times_us: NDArray[np.int64]  # (T,) microseconds, increasing
+    accelerations: Array  # (T, 3) m/s² with gravity, ego frame
+    angular_rates: Array  # (T, 3) rad/s, ego frame
+    velocities: Array  # (T, 3) m/s, ego frame
 
     def kinematics_at(self, timestamp_ns: int) -> Kinematics:
         """The first message after a time, or the last message. The published models were trained this way."""

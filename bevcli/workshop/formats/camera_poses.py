@@ -63,22 +63,15 @@ ADVICE = {"height": HEIGHT, "unit": "pass `rig_unit` (`--rig-unit`), or convert 
 
 @dataclass(frozen=True)
 class StatedPose:
-    """A transform between a camera and the vehicle, as a file states it.
+    """A transform between a camera and the vehicle, as a file states it."""
 
-    Attributes:
-        matrices: (4, 4) by what the numbers of a rotation may be (`rig_angles`); the only one under "".
-        direction: that the name of the transform states; None for none.
-        axes: of the camera frame, if they are known: a key of `AXES`.
-        exact: the direction is certain, and so are the optical axes: nothing is decided.
-        name: in the file.
-        then: (4, 4) camera_from_this: the pose of a neighbour in a chain, from this camera.
-    """
-
+    # (4, 4) by what the numbers of a rotation may be (`rig_angles`); the only one under ""
     matrices: Mapping[str, Array]
-    direction: Direction | None = None
-    axes: str | None = None
-    exact: bool = False
-    name: str = ""
+    direction: Direction | None = None  # that the name of the transform states; None for none
+    axes: str | None = None  # of the camera frame, if they are known: a key of `AXES`
+    exact: bool = False  # the direction is certain, and so are the optical axes: nothing is decided
+    name: str = ""  # in the file
+    # (4, 4) camera_from_this: the pose of a neighbour in a chain, from this camera
     then: Array = field(default_factory=lambda: np.eye(4))
 
     def moved(self, camera_from_other: Array) -> "StatedPose":
@@ -110,25 +103,15 @@ def in_metres(matrix: Array, states: Mapping[str, str]) -> Array:
 
 @dataclass(frozen=True)
 class StatedCamera:
-    """What a file states of a camera.
+    """What a file states of a camera."""
 
-    Attributes:
-        intrinsics: (3, 3) nested lists, pixels; None if they are not stated.
-        size: (width, height) in pixels; None if it is not stated.
-        distortion: as in calibration.json.
-        pose: None if it is not stated.
-        moves: the file has several poses of the camera, as a reconstruction of a drive has.
-        from_previous: (4, 4) camera_from_previous_camera of a Kalibr chain.
-        lens_is_open: four coefficients without the name of a lens, which a fisheye has too.
-    """
-
-    intrinsics: Any = None
-    size: tuple[Any, Any] | None = None
-    distortion: Fields | None = None
-    pose: StatedPose | None = None
-    moves: bool = False
-    from_previous: Array | None = None
-    lens_is_open: bool = False
+    intrinsics: Any = None  # (3, 3) nested lists, pixels; None if they are not stated
+    size: tuple[Any, Any] | None = None  # (width, height) in pixels; None if it is not stated
+    distortion: Fields | None = None  # as in calibration.json
+    pose: StatedPose | None = None  # None if it is not stated
+    moves: bool = False  # the file has several poses of the camera, as a reconstruction of a drive has
+    from_previous: Array | None = None  # (4, 4) camera_from_previous_camera of a Kalibr chain
+    lens_is_open: bool = False  # four coefficients without the name of a lens, which a fisheye has too
 
 
 Cameras: TypeAlias = dict[str, StatedCamera]

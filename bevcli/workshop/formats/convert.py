@@ -26,21 +26,13 @@ NAMES = {"mcap": "an MCAP file", "native": "a sequence folder", "nuscenes": "a n
 
 @dataclass(frozen=True)
 class Converted:
-    """A drive that was written. Its text is one line.
+    """A drive that was written. Its text is one line."""
 
-    Attributes:
-        out: the folder or file.
-        frames: their number.
-        cameras: their number.
-        missing: number of images that were missing.
-        notes: what was left out, one line each.
-    """
-
-    out: Path
-    frames: int
-    cameras: int
-    missing: int
-    notes: tuple[str, ...]
+    out: Path  # the folder or file
+    frames: int  # their number
+    cameras: int  # their number
+    missing: int  # number of images that were missing
+    notes: tuple[str, ...]  # what was left out, one line each
 
     def __str__(self) -> str:
         missing = f", {counted(self.missing, 'images')} missing" if self.missing else ""

@@ -20,17 +20,11 @@ LONG = ("car", "truck", "bus", "trailer", "van", "vehicle", "lorry", "taxi", "su
 
 @dataclass(frozen=True)
 class LabelledFrame:
-    """The boxes of one frame.
+    """The boxes of one frame."""
 
-    Attributes:
-        index: of the frame; None if the file has times only.
-        timestamp_ns: of the frame; None if the file has indices only.
-        boxes: in the frame of reference of the file.
-    """
-
-    index: int | None
-    timestamp_ns: int | None
-    boxes: Boxes3D
+    index: int | None  # of the frame; None if the file has times only
+    timestamp_ns: int | None  # of the frame; None if the file has indices only
+    boxes: Boxes3D  # in the frame of reference of the file
 
 
 @dataclass(frozen=True)

@@ -72,14 +72,7 @@ def _line(ground: Ground, lines: "MapLines", index: int) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class MapLines(FrameResult):
-    """N lines of the map, such as lane dividers.
-
-    Attributes:
-        points: N lines of x and y in the bev frame (P, 2), or of points on the ground in the ego or world frame (P, 3),
-            metres; P may differ.
-        classes: (N,) class names.
-        scores: (N,) confidence, 0 to 1. Optional.
-    """
+    """N lines of the map, such as lane dividers."""
 
     kind = "map_lines"
     file_name = "map_lines.json"
@@ -87,9 +80,11 @@ class MapLines(FrameResult):
     true_file = LINES_FILE
     true_names = LINE_CLASSES
 
+    # N lines of x and y in the bev frame (P, 2), or of points on the ground in the ego or world frame (P, 3), metres; P
+    # may differ
     points: tuple[Array, ...]
-    classes: NDArray[np.str_]
-    scores: Array | None = None
+    classes: NDArray[np.str_]  # (N,) class names
+    scores: Array | None = None  # (N,) confidence, 0 to 1. Optional
 
     def __len__(self) -> int:
         return len(self.points)
@@ -121,18 +116,12 @@ class FrameLines:
 
 @dataclass(frozen=True)
 class LinesFile:
-    """All frames of a file, in its order.
+    """All frames of a file, in its order."""
 
-    Attributes:
-        frame_of_reference: "world" or "ego"; all points are in it.
-        classes: that the lines may have.
-        frames: the frames.
-        extras: further members of the file's JSON object, such as "model".
-    """
-
-    frame_of_reference: str
-    classes: tuple[str, ...]
-    frames: tuple[FrameLines, ...]
+    frame_of_reference: str  # "world" or "ego"; all points are in it
+    classes: tuple[str, ...]  # that the lines may have
+    frames: tuple[FrameLines, ...]  # the frames
+    # further members of the file's JSON object, such as "model"
     extras: Mapping[str, Any] = field(default_factory=dict)
 
 

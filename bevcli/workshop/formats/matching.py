@@ -34,21 +34,13 @@ Found = tuple[tuple[FrameEntry, ...], str]  # frames, and how they were understo
 
 @dataclass(frozen=True)
 class CameraImages:
-    """The images of a camera.
+    """The images of a camera."""
 
-    Attributes:
-        name: of the video or the folder, for messages.
-        times_ns: (N,) int64, increasing.
-        period_ns: from one image to the next.
-        image: an image by its index.
-        is_uneven: the times are not evenly spaced, in a video.
-    """
-
-    name: str
-    times_ns: NDArray[np.int64]
-    period_ns: float
-    image: Callable[[int], Source]
-    is_uneven: bool = False
+    name: str  # of the video or the folder, for messages
+    times_ns: NDArray[np.int64]  # (N,) int64, increasing
+    period_ns: float  # from one image to the next
+    image: Callable[[int], Source]  # an image by its index
+    is_uneven: bool = False  # the times are not evenly spaced, in a video
 
     def nearest(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """(F,) the index of the image nearest to each time, and whether it is near enough to belong to it."""

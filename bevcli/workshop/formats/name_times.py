@@ -52,17 +52,11 @@ DATE = re.compile(
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read the names of images.
+    """One way to read the names of images."""
 
-    Attributes:
-        kind: the unit; "index" for numbers that are no times.
-        values: by camera, of each image: nanoseconds, or indices.
-        since: text that follows the unit: " since 1970", " in UTC", or "".
-    """
-
-    kind: TimeKind
-    values: Mapping[str, Times]
-    since: str = ""
+    kind: TimeKind  # the unit; "index" for numbers that are no times
+    values: Mapping[str, Times]  # by camera, of each image: nanoseconds, or indices
+    since: str = ""  # text that follows the unit: " since 1970", " in UTC", or ""
 
     @property
     def words(self) -> str:

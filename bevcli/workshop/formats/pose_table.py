@@ -70,27 +70,18 @@ XML = (b"<?xml", b"<gpx", b"<kml ")
 
 @dataclass(frozen=True)
 class Table:
-    """The cells of a file of poses.
+    """The cells of a file of poses."""
 
-    Attributes:
-        path: the file.
-        columns: quantity -> name of its column in the file, "" where the file has no names; in the order of the file.
-        places: index of the column of each quantity.
-        text: the text of the file.
-        spans: (T, 3) of each row: its line from 1, its start in the text and its end.
-        separator: of the columns; None for spaces.
-        values: (T,) numbers that take the place of a column, or are a new one.
-        notes: how its numbers were understood.
-    """
-
-    path: Path
+    path: Path  # the file
+    # quantity -> name of its column in the file, "" where the file has no names; in the order of the file
     columns: dict[str, str]
-    places: Mapping[str, int]
-    text: str
-    spans: NDArray[np.int64]
-    separator: str | None
+    places: Mapping[str, int]  # index of the column of each quantity
+    text: str  # the text of the file
+    spans: NDArray[np.int64]  # (T, 3) of each row: its line from 1, its start in the text and its end
+    separator: str | None  # of the columns; None for spaces
+    # (T,) numbers that take the place of a column, or are a new one
     values: Mapping[str, Array] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # how its numbers were understood
 
     def __len__(self) -> int:
         return len(self.spans)

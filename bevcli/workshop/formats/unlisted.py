@@ -35,18 +35,12 @@ ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate o
 
 @dataclass(frozen=True)
 class Timing:
-    """What timing.toml and the options state of images without a table.
+    """What timing.toml and the options state of images without a table."""
 
-    Attributes:
-        start_ns: time of the first image, None if not stated.
-        rate_hz: images per second, None if not stated.
-        times: what the numbers in image names are, None if not stated.
-        cameras: delay of its first image, ns, and images per second, None if not stated, by camera.
-    """
-
-    start_ns: int | None
-    rate_hz: float | None
-    times: TimeKind | None
+    start_ns: int | None  # time of the first image, None if not stated
+    rate_hz: float | None  # images per second, None if not stated
+    times: TimeKind | None  # what the numbers in image names are, None if not stated
+    # delay of its first image, ns, and images per second, None if not stated, by camera
     cameras: Mapping[str, tuple[int, float | None]]
 
 

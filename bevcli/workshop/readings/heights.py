@@ -26,17 +26,11 @@ APART = 0.12  # other heights differ by more than this share
 
 @dataclass(frozen=True)
 class HeightSeen:
-    """The mean height of cameras above the road, and how clear it is.
+    """The mean height of cameras above the road, and how clear it is."""
 
-    Attributes:
-        height_m: metres.
-        clearness: the votes for it by those for any other height.
-        tiles: of the road, that voted.
-    """
-
-    height_m: float
-    clearness: float
-    tiles: int
+    height_m: float  # metres
+    clearness: float  # the votes for it by those for any other height
+    tiles: int  # of the road, that voted
 
 
 def height_above_road(points: MatchedPoints, cameras: Array, steps: Array) -> HeightSeen | None:

@@ -46,23 +46,14 @@ BOTH = ("rig_axes", "pose_axes")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A reading of the rig and one of the poses, together.
+    """A reading of the rig and one of the poses, together."""
 
-    Attributes:
-        rig: None where the rig is certain.
-        poses: None where they are certain, or there are none.
-        cameras: (P, 4, 4) ego_from_camera of each pair of images.
-        steps: (P, 4, 4) ego_b_from_ego_a.
-        way: (S, 4, 4) ego_b_from_ego_a of short steps all over the drive.
-        residual_px: of the matched points; infinite where nothing was compared.
-    """
-
-    rig: RigReading | None
-    poses: PoseReading | None
-    cameras: Array
-    steps: Array
-    way: Array
-    residual_px: float = np.inf
+    rig: RigReading | None  # None where the rig is certain
+    poses: PoseReading | None  # None where they are certain, or there are none
+    cameras: Array  # (P, 4, 4) ego_from_camera of each pair of images
+    steps: Array  # (P, 4, 4) ego_b_from_ego_a
+    way: Array  # (S, 4, 4) ego_b_from_ego_a of short steps all over the drive
+    residual_px: float = np.inf  # of the matched points; infinite where nothing was compared
 
     @property
     def whole(self) -> Reading:

@@ -29,23 +29,14 @@ MOST = 4  # pairs of frames
 
 @dataclass(frozen=True)
 class CameraPair:
-    """Two images of one camera.
+    """Two images of one camera."""
 
-    Attributes:
-        pair: the index of the pair of frames.
-        camera: of the reduced images.
-        times_ns: of the images.
-        rays_a: (m, 3) unit directions of matched points in the first image.
-        rays_b: (m, 3) of the same points in the second one.
-        images: grey, reduced.
-    """
-
-    pair: int
-    camera: Camera
-    times_ns: tuple[int, int]
-    rays_a: Array
-    rays_b: Array
-    images: tuple[GreyImage, GreyImage]
+    pair: int  # the index of the pair of frames
+    camera: Camera  # of the reduced images
+    times_ns: tuple[int, int]  # of the images
+    rays_a: Array  # (m, 3) unit directions of matched points in the first image
+    rays_b: Array  # (m, 3) of the same points in the second one
+    images: tuple[GreyImage, GreyImage]  # grey, reduced
 
 
 @dataclass(frozen=True)

@@ -33,21 +33,14 @@ USUAL = "labels 0.4 to 0.65, demo on rendered streets and photographs anywhere 0
 
 @dataclass(frozen=True)
 class FrameAgreement:
-    """One frame: what is projected and seen in its images, within the range; and how many boxes are kept.
+    """One frame: what is projected and seen in its images, within the range; and how many boxes are kept."""
 
-    Attributes:
-        stamp: of the frame.
-        ours: the projected boxes that are held against the witness, and those that explain one of its objects.
-        theirs: the same of the witness.
-        kept: sums over the boxes: of scores that a frame half a second later keeps, and of scores; zeros without one.
-        is_looked_at: whether the witness saw the frame.
-    """
-
-    stamp: FrameStamp
-    ours: Sightings
-    theirs: Sightings
+    stamp: FrameStamp  # of the frame
+    ours: Sightings  # the projected boxes that are held against the witness, and those that explain one of its objects
+    theirs: Sightings  # the same of the witness
+    # sums over the boxes: of scores that a frame half a second later keeps, and of scores; zeros without one
     kept: tuple[float, float] = (0.0, 0.0)
-    is_looked_at: bool = False
+    is_looked_at: bool = False  # whether the witness saw the frame
 
     @property
     def differences(self) -> int:
@@ -57,19 +50,12 @@ class FrameAgreement:
 
 @dataclass(frozen=True)
 class Part:
-    """Agreement of a group, a camera or a ring of distances.
+    """Agreement of a group, a camera or a ring of distances."""
 
-    Attributes:
-        found: share of the witness's objects that a projected box explains; NaN without any.
-        objects: number of these objects.
-        confirmed: share of the boxes in view that the witness explains; NaN without any.
-        boxes: number of these boxes.
-    """
-
-    found: float
-    objects: int
-    confirmed: float
-    boxes: int
+    found: float  # share of the witness's objects that a projected box explains; NaN without any
+    objects: int  # number of these objects
+    confirmed: float  # share of the boxes in view that the witness explains; NaN without any
+    boxes: int  # number of these boxes
 
     @property
     def row(self) -> tuple[Cell, ...]:
@@ -83,52 +69,33 @@ NO_PART = Part(np.nan, 0, np.nan, 0)
 
 @dataclass(frozen=True)
 class Shift:
-    """The median offset in a camera from projected boxes to seen ones; NaN without pairs.
+    """The median offset in a camera from projected boxes to seen ones; NaN without pairs."""
 
-    Attributes:
-        right_px: pixels.
-        down_px: pixels.
-        scale: height of a seen box as a share of the projected one's.
-        pairs: number of them.
-    """
-
-    right_px: float
-    down_px: float
-    scale: float
-    pairs: int
+    right_px: float  # pixels
+    down_px: float  # pixels
+    scale: float  # height of a seen box as a share of the projected one's
+    pairs: int  # number of them
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of the boxes of one or several drives with the witness.
+    """Agreement of the boxes of one or several drives with the witness."""
 
-    Attributes:
-        score: 0 to 1; None where the witness sees nothing.
-        low: lower end of the interval of 90 % over resamplings of the seconds; None for fewer than three seconds.
-        high: its upper end.
-        kept: share of the boxes that are where motion leads half a second later, by their scores; NaN unknown.
-        groups: "vehicles", "people" and "cycles" -> their agreement.
-        cameras: camera -> agreement of what it shows.
-        distances: "0-10 m" and so on -> agreement of what is at this distance from the vehicle, on flat ground.
-        shifts: camera -> offset between projected and seen boxes.
-        frames: number of frames, and how many of them the witness saw.
-        worst: the frames that differ most, with the number of objects and boxes without a partner.
-        findings: faults that show without labels.
-        notes: why there is no score, or why it says little.
-    """
-
-    score: float | None
+    score: float | None  # 0 to 1; None where the witness sees nothing
+    # lower end of the interval of 90 % over resamplings of the seconds; None for fewer than three seconds
     low: float | None
-    high: float | None
-    kept: float
-    groups: Mapping[str, Part]
-    cameras: Mapping[str, Part]
+    high: float | None  # its upper end
+    kept: float  # share of the boxes that are where motion leads half a second later, by their scores; NaN unknown
+    groups: Mapping[str, Part]  # "vehicles", "people" and "cycles" -> their agreement
+    cameras: Mapping[str, Part]  # camera -> agreement of what it shows
+    # "0-10 m" and so on -> agreement of what is at this distance from the vehicle, on flat ground
     distances: Mapping[str, Part]
-    shifts: Mapping[str, Shift]
-    frames: tuple[int, int]
+    shifts: Mapping[str, Shift]  # camera -> offset between projected and seen boxes
+    frames: tuple[int, int]  # number of frames, and how many of them the witness saw
+    # the frames that differ most, with the number of objects and boxes without a partner
     worst: tuple[tuple[FrameStamp, int], ...] = ()
-    findings: tuple[Finding, ...] = ()
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()  # faults that show without labels
+    notes: tuple[str, ...] = ()  # why there is no score, or why it says little
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON; numbers that are not known are null."""

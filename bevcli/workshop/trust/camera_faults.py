@@ -38,19 +38,12 @@ LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of fact
 
 @dataclass(frozen=True)
 class CameraPoints:
-    """N matched points of one camera, each in the frames before and after a step.
+    """N matched points of one camera, each in the frames before and after a step."""
 
-    Attributes:
-        camera: of the images.
-        rays_a: (N, 3) unit directions in the first frame of the step, camera frame.
-        rays_b: (N, 3) in the second one.
-        times_ns: (N, 2) when both images were taken.
-    """
-
-    camera: Camera
-    rays_a: Array
-    rays_b: Array
-    times_ns: NDArray[np.int64]
+    camera: Camera  # of the images
+    rays_a: Array  # (N, 3) unit directions in the first frame of the step, camera frame
+    rays_b: Array  # (N, 3) in the second one
+    times_ns: NDArray[np.int64]  # (N, 2) when both images were taken
 
     def seen_by(self, camera: Camera) -> "CameraPoints":
         """The points as if another camera had taken the images."""

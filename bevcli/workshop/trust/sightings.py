@@ -30,31 +30,19 @@ POINTS = np.linspace(0, 1, 5)  # of an edge of a box, which a lens bends
 
 @dataclass(frozen=True)
 class Sightings:
-    """N projected boxes of a model, or N boxes that the witness sees.
+    """N projected boxes of a model, or N boxes that the witness sees."""
 
-    Attributes:
-        frames: (N,) index of the frame.
-        cameras: (N,) names.
-        corners: (N, 4) x0, y0, x1, y1 in the image, pixels.
-        groups: (N,) index into GROUPS.
-        distances: (N,) to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon.
-        scores: (N,) 0 to 1.
-        counted: (N,) whether it is held against the other side: whole in the image, large enough, and not hidden.
-        overlaps: (N,) intersection over union with the partner; 0 without one.
-        fits: (N,) how well it fits its partner, 0 to 1, see `_fits`; of what is seen, times the partner's score.
-        partners: (N, 4) corners of the partner; NaN without one.
-    """
-
-    frames: NDArray[np.int64]
-    cameras: NDArray[np.str_]
-    corners: Array
-    groups: NDArray[np.int64]
-    distances: Array
-    scores: Array
+    frames: NDArray[np.int64]  # (N,) index of the frame
+    cameras: NDArray[np.str_]  # (N,) names
+    corners: Array  # (N, 4) x0, y0, x1, y1 in the image, pixels
+    groups: NDArray[np.int64]  # (N,) index into GROUPS
+    distances: Array  # (N,) to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon
+    scores: Array  # (N,) 0 to 1
+    # (N,) whether it is held against the other side: whole in the image, large enough, and not hidden
     counted: NDArray[np.bool_]
-    overlaps: Array
-    fits: Array
-    partners: Array
+    overlaps: Array  # (N,) intersection over union with the partner; 0 without one
+    fits: Array  # (N,) how well it fits its partner, 0 to 1, see `_fits`; of what is seen, times the partner's score
+    partners: Array  # (N, 4) corners of the partner; NaN without one
 
     def __len__(self) -> int:
         return len(self.frames)

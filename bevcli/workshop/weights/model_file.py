@@ -82,19 +82,13 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True)
 class ModelPart:
-    """A part of the model.
+    """A part of the model."""
 
-    Attributes:
-        name: in the paper's terms.
-        modules: beginnings of the part's keys in the state dict.
-        shapes: shapes of the weights with two or more axes, in the order of the state dict; biases and norms left out.
-        parameters: number of learned values, biases and norms included.
-    """
-
-    name: str
-    modules: tuple[str, ...]
+    name: str  # in the paper's terms
+    modules: tuple[str, ...]  # beginnings of the part's keys in the state dict
+    # shapes of the weights with two or more axes, in the order of the state dict; biases and norms left out
     shapes: tuple[Shape, ...]
-    parameters: int
+    parameters: int  # number of learned values, biases and norms included
 
 
 def model_parts(config: ModelConfig) -> tuple[ModelPart, ...]:

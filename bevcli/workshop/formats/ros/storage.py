@@ -52,21 +52,13 @@ Decode = Callable[[bytes], Any]
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag.
+    """A topic of a bag."""
 
-    Attributes:
-        name: such as "/camera/front/image_raw".
-        type_name: as the bag writes it, such as "sensor_msgs/msg/Image".
-        encoding: of its messages: "cdr", "json" or "protobuf".
-        schema: encoding of the definition: "ros2msg", "ros2idl", "jsonschema", "protobuf"; "" if there is none.
-        definition: the definition of the type, empty if there is none.
-    """
-
-    name: str
-    type_name: str
-    encoding: str
-    schema: str = ""
-    definition: bytes = b""
+    name: str  # such as "/camera/front/image_raw"
+    type_name: str  # as the bag writes it, such as "sensor_msgs/msg/Image"
+    encoding: str  # of its messages: "cdr", "json" or "protobuf"
+    schema: str = ""  # encoding of the definition: "ros2msg", "ros2idl", "jsonschema", "protobuf"; "" if there is none
+    definition: bytes = b""  # the definition of the type, empty if there is none
 
     @property
     def short_type(self) -> str:
