@@ -21,7 +21,7 @@ from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.output import NativeWriter
 
-FRAMES = 16
+FRAMES = 40  # as many as a fast machine does not end before a signal
 pytestmark = pytest.mark.usefixtures("unchecked_recordings")
 
 

@@ -72,9 +72,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
                 raise InputError(f"{path}: states all of its poses: remove {named(RigOptions, name)}")
         own = read_ego_motion(path)
         return ReadPoses(own) if own.velocities_are_stated or path.name == EGO_MOTION else _doubted(own, path, drive)
-    from bevcli.workshop.formats.poses import read_poses as read_poses_of_others
-
-    poses = read_poses_of_others(path, drive)
+    poses = _of_others(path, drive)
     if poses is not None:
         return poses
     try:
@@ -83,12 +81,17 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
         raise InputError(f"{error}; other kinds of poses are in docs/other-inputs.md#poses") from None
 
 
-def _doubted(own: EgoMotion, path: Path, drive: DrivePoses) -> ReadPoses:
-    """Poses with the columns of ego_motion.csv, which others write too: believed unless images clearly contradict."""
+def _of_others(path: Path, drive: DrivePoses) -> ReadPoses | None:
+    """Poses of another program; None for a file that is none of these."""
     from bevcli.workshop.formats.poses import read_poses as read_poses_of_others
 
+    return read_poses_of_others(path, drive)
+
+
+def _doubted(own: EgoMotion, path: Path, drive: DrivePoses) -> ReadPoses:
+    """Poses with the columns of ego_motion.csv, which others write too: believed unless images clearly contradict."""
     try:
-        others = read_poses_of_others(path, drive)
+        others = _of_others(path, drive)
     except InputError:
         others = None
     states = {"pose_transform": "world_from_body", "pose_axes": "flu", "poses_of": "vehicle"}
