@@ -180,17 +180,15 @@ def small_grey(pixels_bgr: NDArray[np.uint8], image: ImageConfig) -> NDArray[np.
 
 def grey_view(frame: Frame, greys: Mapping[str, NDArray[np.uint8]]) -> GreyView:
     """Images of `small_grey` by camera, empty where there is none, in the frame's bev frame."""
-    largest = np.max([grey.shape for grey in greys.values()], axis=0)
-    images, projections = np.zeros((len(greys), *largest), np.uint8), []
-    for together, (name, grey) in zip(images, greys.items(), strict=True):
-        together[: grey.shape[0], : grey.shape[1]] = grey
+    projections = []
+    for name, grey in greys.items():
         camera = frame.rig[name]
         scale = np.array([grey.shape[1] / camera.width, grey.shape[0] / camera.height]) if grey.size else np.ones(2)
         grey_from_image = np.diag([*scale, 1.0, 1.0])
         grey_from_image[:2, 2] = (scale - 1) / 2
         projections.append(grey_from_image @ image_from_bev(frame, name))
-    arrays = images, np.stack(projections), frame.rig.ego_from_bev
-    return GreyView(*map(torch.from_numpy, arrays))
+    images = tuple(map(torch.from_numpy, greys.values()))
+    return GreyView(images, *map(torch.from_numpy, (np.stack(projections), frame.rig.ego_from_bev)))
 
 
 def write_network_image(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.float32]) -> None:

@@ -48,7 +48,7 @@ class RoadSlopes:
 class GreyView:
     """The images of a frame, small and grey."""
 
-    images: Tensor  # (N, h, w) uint8, 0 where there is no image
+    images: tuple[Tensor, ...]  # of each camera (h, w) uint8, empty where there is no image
     image_from_bev: Tensor  # (N, 4, 4) float64, bev metres to pixels of these images
     ego_from_bev: Tensor  # (4, 4) float64
 
@@ -97,9 +97,9 @@ def slopes_by_points(first: GreyView, second: GreyView, b_from_a: Array) -> tupl
     rays_a: list[Array] = []
     rays_b: list[Array] = []
     focal, shift = [], []
-    pairs = zip(*(x.numpy() for of in (first, second) for x in (of.images, of.image_from_bev)), strict=True)
-    for image_a, from_bev_a, image_b, from_bev_b in pairs:
-        start, end = _followed(image_a, image_b)
+    matrices = first.image_from_bev.numpy(), second.image_from_bev.numpy()
+    for image_a, image_b, from_bev_a, from_bev_b in zip(first.images, second.images, *matrices, strict=True):
+        start, end = _followed(image_a.numpy(), image_b.numpy())
         turn_a, turn_b = (np.linalg.inv(matrix[:3, :3]) for matrix in (from_bev_a, from_bev_b))
         for rays, turn, pixels in ((rays_a, turn_a, start), (rays_b, turn_b, end)):
             way = np.column_stack([pixels, np.ones(len(pixels))]) @ turn.T
@@ -137,8 +137,10 @@ def slopes_by_points(first: GreyView, second: GreyView, b_from_a: Array) -> tupl
 def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Array, Array]:
     """Pixels (n, 2) of points in two images."""
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
+    if first.shape != second.shape or not second.any():
+        return nothing
     start = cv2.goodFeaturesToTrack(first, POINTS, 0.01, APART)
-    if start is None or not second.any():
+    if start is None:
         return nothing
     end, there, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=WINDOW, maxLevel=LEVELS)  # type: ignore[call-overload]
     back, again, _ = cv2.calcOpticalFlowPyrLK(second, first, end, None, winSize=WINDOW, maxLevel=LEVELS)  # type: ignore[call-overload]

@@ -1,5 +1,7 @@
 """The pitch and roll of the vehicle, by points that images of two frames show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -62,12 +64,23 @@ def test_a_vehicle_that_stands_keeps_what_was_known():
 
 def test_nothing_is_told_by_poses_of_other_images_nor_by_empty_ones():
     before, now = seen(), seen(ahead=2.5)
-    empty = GreyView(torch.zeros_like(now.images), now.image_from_bev, now.ego_from_bev)
+    black, missing = (torch.zeros(shape, dtype=torch.uint8) for shape in ((HEIGHT, WIDTH), (0, 0)))
+    empty = [replace(now, images=(image,) * len(YAWS)) for image in (black, missing)]
     sideways = Pose.from_matrix(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [np.zeros(3), 1]]))
     memory = RoadMemory(before, RoadSlopes(torch.ones(1, 2), 1e-6 * torch.eye(2)[None]))
-    for view in (now, empty):
+    for view in (now, *empty):
         result = expected_slopes(memory, Pose.identity(), view, sideways)
         assert torch.equal(result.covariance, RoadSlopes.unknown().covariance)
         assert not result.mean.any()
     assert expected_slopes(memory, Pose.identity(), None, sideways) is None
     assert torch.equal(expected_slopes(None, None, now, sideways).mean, torch.zeros(1, 2))
+
+
+def test_a_camera_that_lacks_an_image_in_one_of_the_frames_is_left_out():
+    slopes = (-0.006, 0.015)
+    before, now = seen(), seen(slopes, ahead=2.0)
+    none = torch.zeros(0, 0, dtype=torch.uint8)
+    before = replace(before, images=(*before.images[:3], none))
+    now = replace(now, images=(none, *now.images[1:]))
+    known = RoadSlopes(torch.zeros(1, 2), 1e-7 * torch.eye(2)[None])
+    assert told(before, now, 2.0, known).mean[0].tolist() == pytest.approx(slopes, abs=0.001)
