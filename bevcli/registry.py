@@ -26,7 +26,7 @@ OWN: dict[Group, dict[str, str]] = {
         "dgp": "bevcli.workshop.formats:DgpScene",
         "kitti": "bevcli.workshop.formats:KittiDrive",
         "native": "bevcli.sequences.native:NativeFolder",
-        "nuscenes": "bevcli.sequences.nuscenes:NuScenesOptions",
+        "nuscenes": "bevcli.workshop.formats:NuScenesOptions",
         "ros": "bevcli.workshop.formats:BagOptions",
         "t4": "bevcli.workshop.formats:T4Dataset",
         "video": "bevcli.workshop.formats:VideoFile",

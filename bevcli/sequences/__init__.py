@@ -2,6 +2,6 @@
 
 open: `open_sequence`, the way in, which selects a scene, a frame range and a frame rate, and leaves out ground truth.
 options: the options that every format has. format: `Format`, and a path's format. docs/extend.md shows how to add one.
-native, nuscenes: one folder a format. images, videos: decoding the images of a frame.
+native: the sequence folder. images: decoding the images of a frame.
 files: single files that several formats share (boxes, BEV maps, calibration).
 """

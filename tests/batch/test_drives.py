@@ -7,10 +7,10 @@ from sequences.nuscenes_tables import Size, write_tables
 from small_fleet import write_drive
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch.job import find_drives, read_list
 from bevcli.workshop.batch.storage import open_storage
+from bevcli.workshop.formats import NuScenesOptions
 
 
 def test_patterns_lists_and_paths_give_each_drive_once(tmp_path):

@@ -20,13 +20,12 @@ from small_fleet import make_job, results_of, write_drive, write_fleet
 
 from bevcli.errors import InputError, OutputError
 from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
-from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch import worker as worker_module
 from bevcli.workshop.batch.batch import Batch
 from bevcli.workshop.batch.job import find_drives
 from bevcli.workshop.batch.worker import Worker
-from bevcli.workshop.formats import BagOptions
+from bevcli.workshop.formats import BagOptions, NuScenesOptions
 from bevcli.workshop.scores.evaluate import evaluate
 
 COMPARED = ("predictions.json", "tracks.csv")

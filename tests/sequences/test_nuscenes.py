@@ -13,11 +13,11 @@ from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_
 
 from bevcli.errors import InputError
 from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
-from bevcli.sequences.nuscenes import NuScenesOptions, tables
-from bevcli.sequences.nuscenes.index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
-from bevcli.sequences.nuscenes.sequence import NuScenesDrive, read_can_bus
-from bevcli.sequences.nuscenes.tables import build_index
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.formats import NuScenesOptions, nuscenes_tables as tables
+from bevcli.workshop.formats.nuscenes import NuScenesDrive, read_can_bus
+from bevcli.workshop.formats.nuscenes_index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
+from bevcli.workshop.formats.nuscenes_tables import build_index
 from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.scores.inputs import open_ground_truth
 
@@ -369,7 +369,7 @@ def test_large_tables_take_little_memory(tmp_path):
     scenes = int(os.environ.get("BEVCLI_SCENES", "40"))
     write_tables(tmp_path / "v1.0-trainval", Size(scenes=scenes))
     code = (
-        "import sys; from pathlib import Path; from bevcli.sequences.nuscenes.sequence import NuScenesDrive\n"
+        "import sys; from pathlib import Path; from bevcli.workshop.formats.nuscenes import NuScenesDrive\n"
         "sequence = NuScenesDrive(Path(sys.argv[1]))\n"
         # Not getrusage: a child's peak there begins with what its parent had.
         "peak = Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0]\n"

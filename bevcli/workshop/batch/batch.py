@@ -18,7 +18,6 @@ from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs import RunOptions
 from bevcli.runs.state import folder_lock
 from bevcli.sequences.format import formats
-from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, Workers, storage
 from bevcli.workshop.batch.job import (
@@ -33,6 +32,7 @@ from bevcli.workshop.batch.job import (
 )
 from bevcli.workshop.batch.report import METRICS as METRICS, write_results
 from bevcli.workshop.batch.worker import Worker, run_on_ray, use_threads
+from bevcli.workshop.formats import NuScenesOptions
 
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 OF_EXPORT = "the first drive of each number of cameras and image size exports the model, and waits for it"

@@ -18,9 +18,9 @@ from bevcli.inference import ModelOptions
 from bevcli.printing import say
 from bevcli.recording import RecordingOptions
 from bevcli.runs import RunOptions
-from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
+from bevcli.workshop.formats import NuScenesOptions
 
 if TYPE_CHECKING:
     from bevcli.published import NamedWeights

@@ -28,12 +28,12 @@ from bevcli.options import defaults, gather
 from bevcli.parsing.files import MIB, hash_of_file, hash_of_values, read_text
 from bevcli.runs import RunOptions
 from bevcli.sequences.format import Format, check_options, drives_in, format_of, formats, is_drive
-from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
-from bevcli.sequences.nuscenes.index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
-from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch.storage import RemoteFolder, Storage, StoredFile, expand, is_url, open_storage
+from bevcli.workshop.formats import NuScenesOptions, is_nuscenes_root
+from bevcli.workshop.formats.nuscenes_index import choose_version, chosen_scenes, keyframes, sweep_frames, tables_of
+from bevcli.workshop.formats.nuscenes_tables import open_index
 from bevcli.writing import user_cache, weights_folder
 
 LISTING_THREADS = 32  # listing a folder in an object store is waiting

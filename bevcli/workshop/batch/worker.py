@@ -33,10 +33,10 @@ from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.runs.state import save_state
 from bevcli.runs.summary import SUMMARY
 from bevcli.sequences.format import format_of
-from bevcli.sequences.nuscenes import NuScenesOptions
 from bevcli.workshop.batch import Workers, ray_is_installed, storage
 from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch_scene, read_record
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
+from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.scores.evaluate import Scores, evaluate
 from bevcli.workshop.trust.estimate import agreement_of_run
 from bevcli.writing import remove_abandoned

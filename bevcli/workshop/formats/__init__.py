@@ -78,6 +78,37 @@ class DgpScene(Format):
 
 
 @options("Input")
+class NuScenesOptions(Format):
+    """A nuScenes root, and the part of it that is read."""
+
+    name = "a nuScenes root"
+    expected = "v1.0-*/scene.json"
+    reader = "bevcli.workshop.formats.nuscenes:NuScenesDrive"
+    annotated = True
+    precedence = 20
+
+    version: str | None = option(
+        default=None, help="nuScenes: dataset version, such as v1.0-mini. Default: the only one present."
+    )
+    split: str | None = option(
+        default=None, help="nuScenes: only scenes of this split (train, val, test, mini_train, mini_val)."
+    )
+    sweeps: bool = option(
+        default=False, help="nuScenes: also read the images between keyframes (12 frames per second)."
+    )
+
+    @property
+    def wants_all_frames(self) -> bool:
+        """With sweeps, every frame is kept unless a rate is given."""
+        return self.sweeps
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """True if a folder contains the tables of a nuScenes version."""
+        return is_nuscenes_root(path)
+
+
+@options("Input")
 class T4Dataset(Format):
     """A T4 dataset."""
 
@@ -233,6 +264,16 @@ class ExportOptions:
     camera: str | None = option(
         default=None, help="kitti: the camera. Default: CAM_FRONT, else the one that looks most directly ahead."
     )
+
+
+def versions_in(root: Path) -> list[str]:
+    """The versions whose tables a folder contains, such as "v1.0-mini" for ROOT/v1.0-mini/scene.json."""
+    return sorted(path.parent.name for path in root.glob("v1.*/scene.json"))
+
+
+def is_nuscenes_root(path: Path) -> bool:
+    """True if a folder contains the tables of a nuScenes version."""
+    return bool(versions_in(path))
 
 
 def is_packed_bag(path: Path) -> bool:

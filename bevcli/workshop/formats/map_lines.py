@@ -25,7 +25,7 @@ from bevcli.recording.entities import map_colors
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.sequences.native.folder import LINES_FILE
-from bevcli.sequences.nuscenes.tables import read_rows
+from bevcli.workshop.formats.nuscenes_tables import read_rows
 
 FORMAT = "bevcli-map-lines/1"
 # The classes of the true lines of drives, which are those of the published VAD.

@@ -16,11 +16,10 @@ from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.files import is_file_name
 from bevcli.parsing.images import encode_image
-from bevcli.sequences.nuscenes import NuScenesOptions, versions_in
-from bevcli.sequences.nuscenes.index import CLASS_OF_CATEGORY, NUSCENES
-from bevcli.sequences.nuscenes.sequence import NuScenesDrive
-from bevcli.sequences.nuscenes.tables import Row
-from bevcli.workshop.formats import WriteOptions
+from bevcli.workshop.formats import NuScenesOptions, WriteOptions, versions_in
+from bevcli.workshop.formats.nuscenes import NuScenesDrive
+from bevcli.workshop.formats.nuscenes_index import CLASS_OF_CATEGORY, NUSCENES
+from bevcli.workshop.formats.nuscenes_tables import Row
 from bevcli.workshop.formats.output import FolderWriter, same_rig
 from bevcli.writing import write_whole
 

@@ -4,10 +4,10 @@ from pathlib import Path
 
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.format import Format
-from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.sequences.nuscenes.index import Dialect
-from bevcli.sequences.nuscenes.sequence import TableDrive
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.formats import NuScenesOptions
+from bevcli.workshop.formats.nuscenes import TableDrive
+from bevcli.workshop.formats.nuscenes_index import Dialect
 
 LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
 # The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.

@@ -19,7 +19,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nu
 from bevcli.geometry.transforms import inverse
 from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
-from bevcli.sequences.nuscenes import NuScenesOptions
+from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.scores import ResultOptions, inputs
 from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
 from bevcli.workshop.scores.plots import write_plots

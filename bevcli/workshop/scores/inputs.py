@@ -18,11 +18,11 @@ from bevcli.sequences.files.boxes_file import BoxesFile, ClassNames, FrameBoxes,
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.sequences.files.map_folder import MapFolder, open_maps
 from bevcli.sequences.format import formats
-from bevcli.sequences.nuscenes import NuScenesOptions, is_nuscenes_root
-from bevcli.sequences.nuscenes.index import chosen_scenes, tables_of
-from bevcli.sequences.nuscenes.tables import open_index
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.formats import NuScenesOptions, is_nuscenes_root
+from bevcli.workshop.formats.nuscenes_index import chosen_scenes, tables_of
+from bevcli.workshop.formats.nuscenes_tables import open_index
 from bevcli.workshop.formats.submission import is_submission, read_submission
 from bevcli.workshop.scores.detection import DetectionScores
 

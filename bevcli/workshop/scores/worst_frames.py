@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.matching import ScoredBoxes
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.format import is_drive
-from bevcli.sequences.nuscenes import is_nuscenes_root
+from bevcli.workshop.formats import is_nuscenes_root
 from bevcli.workshop.scores.detection import ClassMatches
 from bevcli.workshop.scores.inputs import Compared
 from bevcli.workshop.scores.tables import Table

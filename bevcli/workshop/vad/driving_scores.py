@@ -18,7 +18,7 @@ from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.files.json_fields import pose_from_json
-from bevcli.sequences.nuscenes import is_nuscenes_root
+from bevcli.workshop.formats import is_nuscenes_root
 from bevcli.workshop.formats.map_lines import LINE_CLASSES, LINES_FILE, FrameLines, LinesFile, MapLines, read_lines
 from bevcli.workshop.scores import ResultOptions
 from bevcli.workshop.scores.inputs import Compared, FramePairs, ScoredInput

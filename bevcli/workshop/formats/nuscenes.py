@@ -16,10 +16,11 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframe
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.calibration_file import checked_camera
-from bevcli.sequences.format import TrueResult
 from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
-from bevcli.sequences.nuscenes import NuScenesOptions
-from bevcli.sequences.nuscenes.index import (
+from bevcli.sequences.options import InputOptions
+from bevcli.workshop.formats import NuScenesOptions
+from bevcli.workshop.formats.map_lines import MapExpansion
+from bevcli.workshop.formats.nuscenes_index import (
     NUSCENES,
     Dialect,
     Images,
@@ -32,8 +33,7 @@ from bevcli.sequences.nuscenes.index import (
     sweep_frames,
     tables_of,
 )
-from bevcli.sequences.nuscenes.tables import open_index, read_rows
-from bevcli.sequences.options import InputOptions
+from bevcli.workshop.formats.nuscenes_tables import open_index, read_rows
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = tuple(NUSCENES_YAWS_DEG)
@@ -187,7 +187,8 @@ class NuScenesDrive(TableDrive):
         tables = tables_of(root, own.version)
         super().__init__(root, tables, common, NUSCENES, own)
         self.name = common.scene or own.split or tables.name
-        self._true_lines = _true_lines(root, tables) if common.ground_truth else None
+        expansion = root / "maps/expansion"
+        self._true_lines = MapExpansion(expansion, tables) if common.ground_truth and is_there(expansion) else None
         note = self._can_bus_note()
         self.notes = (*self.notes, note) if note else self.notes
 
@@ -203,16 +204,6 @@ class NuScenesDrive(TableDrive):
             return ""
         which = without[0] if len(without) == 1 else f"{len(without)} of {len(names)} scenes"
         return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"
-
-
-def _true_lines(root: Path, tables: Path) -> TrueResult | None:
-    """The reader of the lines of the map; None for a root without the map expansion. Raises InputError."""
-    folder = root / "maps/expansion"
-    if not is_there(folder):
-        return None
-    from bevcli.workshop.formats.map_lines import MapExpansion
-
-    return MapExpansion(folder, tables)
 
 
 def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:

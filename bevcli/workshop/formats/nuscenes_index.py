@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import nearest
 from bevcli.geometry.transforms import Array, rotation_from_quaternion, yaw_of_rotation
-from bevcli.sequences.nuscenes import versions_in
+from bevcli.workshop.formats import versions_in
 
 Ints = NDArray[np.int64]
 

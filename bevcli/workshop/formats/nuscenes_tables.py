@@ -27,7 +27,7 @@ from bevcli.geometry.ego_motion import nearest
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import LARGEST_INTEGER, parse_json, without_garbage_collection
 from bevcli.parsing.files import open_regular, read_bytes
-from bevcli.sequences.nuscenes.index import (
+from bevcli.workshop.formats.nuscenes_index import (
     NUSCENES,
     Annotations,
     Dialect,
