@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from bevcli.workshop.engines.exported import export_onnx as export_onnx, quantize as quantize
     from bevcli.workshop.formats.convert import convert as convert
     from bevcli.workshop.formats.export import export as export
-    from bevcli.workshop.hub import pack_model as pack_model
     from bevcli.workshop.live import Session as Session
     from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare
@@ -59,6 +58,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.training.train import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
     from bevcli.workshop.video import video as video
+    from bevcli.workshop.weights.hub import pack_model as pack_model
     from bevcli.workshop.weights.model_file import model_file_for as model_file_for
 
 

@@ -150,7 +150,7 @@ def hub_model(name: str, *, fetch: bool = False) -> HubModel:
 
     name: as of `is_of_hub`. fetch: look for a newer version of a model that is here. Raises BevcliError.
     """
-    from bevcli.workshop.hub import open_model
+    from bevcli.workshop.weights.hub import open_model
 
     return open_model(name, fetch=fetch)
 

@@ -44,7 +44,7 @@ def test_a_run_opens_no_connection(tmp_path):
     ids=lambda value: " ".join(map(str, value[:2])) if isinstance(value, tuple) else "",
 )
 def test_weights_are_never_fetched_without_being_asked(arguments, said, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "bevcli.weights.fetch", None)
+    monkeypatch.setitem(sys.modules, "bevcli.workshop.weights.fetch", None)
     monkeypatch.setenv("BEVCLI_WEIGHTS_DIR", str(tmp_path))
     done = command(tmp_path, *arguments)
     assert said in done.stdout + done.stderr

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from bevcli.inference.load import Model
     from bevcli.published import NamedWeights
     from bevcli.sequences.options import InputOptions
-    from bevcli.weights.fetch import FetchedWeights
+    from bevcli.workshop.weights.fetch import FetchedWeights
 
 T = TypeVar("T")
 
@@ -159,7 +159,7 @@ def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedW
 
     The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
     """
-    from bevcli.weights.fetch import download_weights, fetch_weights
+    from bevcli.workshop.weights.fetch import download_weights, fetch_weights
 
     bar: Progress | None = None
     with ExitStack() as shown:

@@ -399,7 +399,7 @@ def _published(name: str, options: ModelOptions, otherwise: str = "") -> Path:
     elif named.file is None:
         how = f"they {named.by_hand}"
     elif options.fetch:
-        from bevcli.weights.fetch import fetch_weights
+        from bevcli.workshop.weights.fetch import fetch_weights
 
         return fetch_weights(named).path
     elif options.weights_dir in (None, weights_folder().absolute()):

@@ -22,8 +22,8 @@ from bevcli.config import as_table, config_of_table, known_models, load_config
 from bevcli.errors import BevcliError, InputError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
-from bevcli.weights import fetch
-from bevcli.workshop.hub import import_hub, pack_model
+from bevcli.workshop.weights import fetch
+from bevcli.workshop.weights.hub import import_hub, pack_model
 
 FIRST, SECOND = "1" * 40, "2" * 40
 

@@ -25,8 +25,8 @@ from bevcli.inference import ModelOptions
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
 from bevcli.published import all_weights, named_weights, own_table, read_sources
-from bevcli.weights import fetch
-from bevcli.weights.fetch import download_weights, fetch_weights
+from bevcli.workshop.weights import fetch
+from bevcli.workshop.weights.fetch import download_weights, fetch_weights
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_download_that_ends_keeps_what_came(server, model, content, tmp_path, 
 
 
 def test_weights_that_are_here_import_no_download():
-    modules = ("bevcli.weights.fetch", "bevcli.workshop.engines.engine")
+    modules = ("bevcli.workshop.weights.fetch", "bevcli.workshop.engines.engine")
     code = f"import sys, bevcli; bevcli.load_model('demo'); print([name for name in {modules} if name in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 

@@ -15,7 +15,7 @@ from bevcli.inference import ModelOptions
 from bevcli.options import Option
 from bevcli.printing import aligned, counted, print_note, say
 from bevcli.registry import is_of_hub
-from bevcli.weights import ModelFileOptions, PackOptions
+from bevcli.workshop.weights import ModelFileOptions, PackOptions
 
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
@@ -166,7 +166,7 @@ def pack(
     huggingface_hub does that. `--model hf:OWNER/NAME` then loads the model, equal to the last bit, and
     `--model hf:./DIR` before.
     """
-    from bevcli.workshop.hub import pack_model
+    from bevcli.workshop.weights.hub import pack_model
 
     files, notes = pack_model(name, out, options)
     for note in notes:

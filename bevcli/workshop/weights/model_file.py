@@ -16,7 +16,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.options import gather
 from bevcli.printing import counted
-from bevcli.weights import ModelFileOptions
+from bevcli.workshop.weights import ModelFileOptions
 from bevcli.writing import write_whole
 
 

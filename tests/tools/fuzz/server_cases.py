@@ -5,7 +5,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from random import Random
 
-from bevcli.weights import fetch
+from bevcli.workshop.weights import fetch
 
 MOST_REQUESTS = fetch.ATTEMPTS + fetch.LEAST_SHARE + 1
 

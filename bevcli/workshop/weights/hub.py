@@ -33,8 +33,8 @@ from bevcli.parsing.documents import parse_json
 from bevcli.parsing.files import MIB, hash_of_file, is_file_name, read_bytes, read_text
 from bevcli.printing import one_line, reason_of
 from bevcli.published import HubModel, Known, all_weights
-from bevcli.weights import PackOptions
-from bevcli.weights.fetch import LENGTH_DIGITS, MOST_BYTES, steady
+from bevcli.workshop.weights import PackOptions
+from bevcli.workshop.weights.fetch import LENGTH_DIGITS, MOST_BYTES, steady
 from bevcli.writing import write_whole
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
