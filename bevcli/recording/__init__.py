@@ -8,7 +8,7 @@
     log_cameras     one camera's pose, image and overlays; boxes in its image, with labels
     log_boxes       boxes and ground truth in 3D, from above and on the street map; misses, false positives, trails
     log_static      all that is written once: rig, vehicle, range rings, pillars, legend, the page "About"
-    meshes          the default car, and meshes of files, which `mesh_file` reads in a process of its own
+    meshes          the default car; `bevcli.workshop.meshes` reads files
 
 `bevcli.viewer` reads and shows recordings; nothing here imports it.
 """

@@ -1,37 +1,15 @@
-"""Meshes: the default car, that of a file, and those of classes, which stand in the scene scaled to each box.
+"""The default car, and the type of all meshes. `bevcli.workshop.meshes` reads those of files."""
 
-trimesh reads them in a process of its own with limits of memory and time, see `mesh_file`.
-"""
-
-import io
-import os
-import subprocess
-from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
-from bevcli.geometry.object_classes import Color, ObjectClass
+from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.files import MIB, open_regular, run_python
-from bevcli.recording.entities import EGO_COLOR, class_colors
+from bevcli.recording.entities import EGO_COLOR
 
-FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
-MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process
-READ = """
-import sys
-from bevcli.recording.mesh_file import write_parts
-limit_memory()
-sys.exit(write_parts(*sys.argv[1:]))
-"""
-LONGEST_M = 50.0  # a longer mesh is not in metres
-MOST_TRIANGLES = 100_000  # of a mesh, which is drawn once for each box
-FARTHEST = 1e9  # of a vertex from the origin, in the file's units
 BODY_LWH = (4.6, 1.86, 0.75)
 REAR_AXLE_TO_MIDDLE = 1.35  # metres ahead; the ego frame's origin is on the ground under the rear axle
 WHEELBASE, TRACK = 2.75, 1.64
@@ -94,83 +72,3 @@ def _prism(outline: Array, height: float) -> Array:
     first_low, first_high = (side[:1].repeat(len(side) - 2, 0) for side in (low, high))
     caps = [(first_low, low[2:], low[1:-1]), (first_high, high[1:-1], high[2:])]  # fans
     return np.concatenate([np.stack(corners, axis=1) for corners in (*sides, *caps)])
-
-
-def load_vehicle(path: Path) -> VehicleMesh:
-    """The vehicle from a mesh file: .glb, .gltf, .ply, .obj, .stl or .off, read by trimesh.
-
-    The file must be in metres, with its origin on the ground under the middle of the rear axle. Files in glTF format
-    (.glb, .gltf) have glTF's axes: x left, y up, z forward. All other files have the ego frame's axes: x forward,
-    y left, z up. Parts without a colour get the default car's blue.
-
-    Materials, textures and buffers that the file names are read only in its own folder.
-
-    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles or is
-    longer than 50 m.
-    """
-    mesh = read_mesh(path)
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    if not np.isfinite(mesh.vertices).all() or not (high - low).max() <= LONGEST_M:
-        size = " x ".join(f"{length:.4g}" for length in high - low)
-        raise InputError(
-            f"{path}: the vehicle's size is {size} m (expected at most {LONGEST_M:g} m; scale it to metres)"
-        )
-    (x0, y0), (x1, y1) = low[:2], high[:2]
-    middle, half, length = (y0 + y1) / 2, (y1 - y0) / 2, x1 - x0
-    outline = np.array([[x1, y0], [x1, y1], [x0, y1], [x0, y0], [x1, y0]])
-    arrow = np.array([[-0.32 * length, -0.86 * half], [-0.08 * length, 0], [-0.32 * length, 0.86 * half]])
-    return VehicleMesh(mesh, (outline, arrow + (x1, middle)))  # from above: a rectangle, and an arrow at its front
-
-
-def read_class_meshes(classes: Mapping[str, ObjectClass]) -> dict[str, Mesh]:
-    """The meshes of the classes that have one, by class, scaled to a cube of 1 m around the origin.
-
-    Parts of a mesh without a colour have that of the class. A file that did not change is read once in a process.
-    Raises InputError for a file that `read_mesh` does not take, and for one of more than MOST_TRIANGLES triangles.
-    """
-    colors = class_colors(classes.values())
-    return {name: _read(name, Path(settings.mesh), colors[name]) for name, settings in classes.items() if settings.mesh}
-
-
-def _read(name: str, path: Path, color: Color) -> Mesh:
-    try:
-        with open_regular(path) as file:
-            changed_ns = os.fstat(file.fileno()).st_mtime_ns
-        return _unit_cube(path, color, changed_ns)
-    except InputError as error:
-        raise InputError(f'mesh of class "{name}": {error}') from None
-
-
-@lru_cache(maxsize=16)
-def _unit_cube(path: Path, color: Color, changed_ns: int) -> Mesh:
-    """changed_ns: time of the file's last change; a file that has changed is read again."""
-    mesh = read_mesh(path, color)
-    if len(mesh.faces) > MOST_TRIANGLES:
-        raise InputError(f"{path}: the mesh has {len(mesh.faces):,} triangles (expected at most {MOST_TRIANGLES:,})")
-    if not np.abs(mesh.vertices).max() < FARTHEST:
-        raise InputError(f"{path}: a number of the mesh is not finite, or too large (expected less than {FARTHEST:g})")
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    extents = np.where(high > low, high - low, 1)  # a flat mesh stays flat
-    normals = mesh.normals * extents
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
-    return mesh._replace(vertices=(mesh.vertices - (low + high) / 2) / extents, normals=normals)
-
-
-def read_mesh(path: Path, color: Color = EGO_COLOR) -> Mesh:
-    """All triangles of a mesh file, with the axes of the ego frame. color: of the parts that have none.
-
-    Raises InputError where trimesh cannot read the file within 1 GiB and 20 s, and where it has no triangles.
-    """
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(f"{path}: is not a mesh file (expected a name that ends in {', '.join(FORMATS)})")
-    try:
-        done = run_python(READ, [path, *color], MEMORY, SECONDS)
-    except subprocess.TimeoutExpired:
-        raise InputError(f"{path}: takes more than {SECONDS:.0f} s to read (expected fewer triangles)") from None
-    if done.returncode == 0:
-        file = io.BytesIO(done.stdout)
-        return Mesh(*(np.load(file, allow_pickle=False) for _ in range(4)))
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    if done.returncode == 1 and lines:
-        raise InputError(lines[-1])
-    raise InputError(f"{path}: ends trimesh, which reads it (expected a mesh of fewer triangles)")

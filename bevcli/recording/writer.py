@@ -23,7 +23,7 @@ from bevcli.frame import BevMap, Frame, FrameStamp, GroundLines, Prediction, res
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, Pose, apply, inverse, rigid
-from bevcli.recording import RecordingOptions, entities, log_boxes, log_cameras, log_static, meshes
+from bevcli.recording import RecordingOptions, entities, log_boxes, log_cameras, log_static
 from bevcli.recording.blueprint import recording_blueprint
 from bevcli.recording.entities import any_values, components, log
 from bevcli.recording.log_cameras import ImageLayer, PosedCamera
@@ -159,8 +159,10 @@ class Recording:
         recorded, path = self._recorded, self._options.vehicle_mesh
         vehicle, of_classes = None, {}
         if path is not None or self._with_meshes:
-            vehicle = None if path is None else meshes.load_vehicle(path)
-            of_classes = meshes.read_class_meshes(recorded.object_classes)
+            from bevcli.workshop.meshes import load_vehicle, read_class_meshes
+
+            vehicle = None if path is None else load_vehicle(path)
+            of_classes = read_class_meshes(recorded.object_classes)
         self._bytes = rr.binary_stream(self._stream)
         self.file = GrowingFile(self.path, self._resume_at)
         self._send_layout(follows=self._live is not None)

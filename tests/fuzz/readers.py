@@ -135,7 +135,7 @@ def _checkpoint(folder: Path) -> None:
 
 
 def _vehicle(folder: Path) -> None:
-    from bevcli.recording.meshes import load_vehicle
+    from bevcli.workshop.meshes import load_vehicle
 
     load_vehicle(folder / "vehicle.glb")
 

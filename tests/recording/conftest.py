@@ -7,7 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from bevcli.recording import mesh_file, meshes
+from bevcli.workshop import meshes
+from bevcli.workshop.meshes import mesh_file
 
 
 @pytest.fixture

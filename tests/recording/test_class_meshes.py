@@ -11,10 +11,11 @@ from recorded_drive import TINY, NamedModel, boxes_ahead, predict
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import InputError
 from bevcli.geometry.object_classes import ClassSettings, are_nuscenes
-from bevcli.recording import entities, meshes
+from bevcli.recording import entities
 from bevcli.recording.entities import class_colors
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.workshop import meshes
 
 CAR = class_colors(TINY.object_classes.values())["car"]
 

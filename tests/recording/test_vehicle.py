@@ -11,11 +11,13 @@ from recorded_drive import record
 
 from bevcli.errors import InputError
 from bevcli.parsing.files import read_bytes
-from bevcli.recording import RecordingOptions, entities, mesh_file, meshes
+from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.entities import EGO_COLOR
-from bevcli.recording.mesh_file import read_parts
-from bevcli.recording.meshes import default_vehicle, load_vehicle
+from bevcli.recording.meshes import default_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
+from bevcli.workshop import meshes
+from bevcli.workshop.meshes import load_vehicle, mesh_file
+from bevcli.workshop.meshes.mesh_file import read_parts
 
 RED = (200, 10, 20)
 

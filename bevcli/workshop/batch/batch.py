@@ -14,7 +14,6 @@ from bevcli.inference import ModelOptions
 from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.options import defaults, spread
 from bevcli.recording import RecordingOptions
-from bevcli.recording.meshes import read_class_meshes
 from bevcli.runs import RunOptions
 from bevcli.runs.state import folder_lock
 from bevcli.sequences.format import formats
@@ -33,6 +32,7 @@ from bevcli.workshop.batch.job import (
 from bevcli.workshop.batch.report import METRICS as METRICS, write_results
 from bevcli.workshop.batch.worker import Worker, run_on_ray, use_threads
 from bevcli.workshop.formats import NuScenesOptions
+from bevcli.workshop.meshes import read_class_meshes
 
 DESCRIPTION = "batch.json"  # says that a folder is a batch
 OF_EXPORT = "the first drive of each number of cameras and image size exports the model, and waits for it"

@@ -19,13 +19,13 @@ from small_model import small_inputs, small_model, step_of_file
 from bevcli.config import as_table
 from bevcli.inference.load import Model
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.recording.meshes import load_vehicle
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.batch.batch import BatchSummary
 from bevcli.workshop.batch.job import read_record
 from bevcli.workshop.batch.report import to_csv, to_parquet, write_report
 from bevcli.workshop.engines.export_onnx import export_onnx
 from bevcli.workshop.engines.exported import load_exported
+from bevcli.workshop.meshes import load_vehicle
 
 onnx = pytest.importorskip("onnx")
 for package in ("onnxruntime", "openvino"):

@@ -1,6 +1,6 @@
 """The triangles of a mesh file, read by trimesh, which takes half a second to load: in a process of its own.
 
-See `bevcli.recording.meshes` for who starts it.
+See `bevcli.workshop.meshes` for who starts it.
 """
 
 import io
@@ -28,7 +28,7 @@ EGO_FROM_GLTF = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 
 
 
 def write_parts(path: str, *color: str) -> str | None:
-    """Write the arrays of a mesh file to stdout, for `meshes.read_mesh`. Returns what `sys.exit` takes."""
+    """Write the arrays of a mesh file to stdout, for `read_mesh`. Returns what `sys.exit` takes."""
     try:
         corners, normals, faces, colors = zip(*read_parts(Path(path), tuple(map(int, color))), strict=True)
         starts = np.cumsum([0, *map(len, corners[:-1])])
