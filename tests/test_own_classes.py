@@ -11,12 +11,12 @@ from bevcli.config import as_table, config_of_table, load_config
 from bevcli.errors import ConfigError, InputError
 from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.cameras import Camera
-from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, are_nuscenes, object_classes
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.recording.entities import class_colors
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.workshop.formats.kitti import kitti_labels
+from bevcli.workshop.scores.config import DetectionConfig
 from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.scores.tracking import TrackingConfig
 

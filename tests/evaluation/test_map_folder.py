@@ -12,10 +12,10 @@ from random_boxes import as_predictions, random_truth
 from bevcli.errors import InputError
 from bevcli.frame import BevMap
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import DetectionConfig
 from bevcli.runs.state import load_state, save_state
 from bevcli.sequences.files.map_folder import open_maps, write_map
 from bevcli.workshop.batch.report import DriveMatches, score_jointly
+from bevcli.workshop.scores.config import DetectionConfig
 from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation
 

@@ -7,9 +7,9 @@ import pytest
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import DetectionConfig
 from bevcli.recording.entities import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
 from bevcli.recording.log_boxes import detectable, ground_truth_colors, other_classes, true_positives
+from bevcli.workshop.scores.config import DetectionConfig
 from bevcli.workshop.scores.detection import evaluate_detections
 
 

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from bevcli._version import __version__
 from bevcli.frame import MAP_CLASSES
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import ERRORS, DetectionConfig, ScoredBoxes
+from bevcli.geometry.matching import ScoredBoxes
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig
@@ -28,6 +28,7 @@ from bevcli.printing import cell_of, counted, duration
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.job import Record
 from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage
+from bevcli.workshop.scores.config import ERRORS, DetectionConfig
 from bevcli.workshop.scores.detection import ClassMatches, DetectionScores, with_all_columns
 from bevcli.workshop.scores.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
 

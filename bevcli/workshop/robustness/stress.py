@@ -12,7 +12,6 @@ import msgspec
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import DetectionConfig
 from bevcli.inference import StepOptions
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
@@ -25,6 +24,7 @@ from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness import StressOptions
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
+from bevcli.workshop.scores.config import DetectionConfig
 from bevcli.workshop.scores.detection import evaluate_detections, known_mean
 from bevcli.workshop.scores.evaluate import boxes_ego, finite
 from bevcli.workshop.synth import DriveOptions

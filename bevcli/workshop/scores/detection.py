@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.matching import ERRORS, DetectionConfig, ScoredBoxes, descending_scores, match_greedily
+from bevcli.geometry.matching import ScoredBoxes, descending_scores, match_greedily
 from bevcli.geometry.transforms import Array, wrap_angle
+from bevcli.workshop.scores.config import ERRORS, DetectionConfig
 
 RECALLS = np.linspace(0, 1, 101)
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from bevcli.frame import MAP_CLASSES, BevMap, Frame, Prediction
 from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, attributes_by_speed
-from bevcli.geometry.matching import ERRORS, DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass, are_nuscenes
 from bevcli.geometry.transforms import inverse
 from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.scores import ResultOptions, inputs
+from bevcli.workshop.scores.config import ERRORS, DetectionConfig
 from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
 from bevcli.workshop.scores.plots import write_plots
 from bevcli.workshop.scores.tables import Cell, Table

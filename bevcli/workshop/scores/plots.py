@@ -14,9 +14,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
-from bevcli.geometry.matching import ERRORS, ScoredBoxes
+from bevcli.geometry.matching import ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted
+from bevcli.workshop.scores.config import ERRORS
 from bevcli.workshop.scores.detection import RECALLS, ClassScores, DetectionScores, ScoreTable
 from bevcli.workshop.scores.inputs import FramePairs
 from bevcli.workshop.scores.worst_frames import MODELS, Outcome, best_outcome

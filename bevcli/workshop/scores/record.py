@@ -8,7 +8,6 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import ranges_m
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.printing import counted
 from bevcli.recording import RecordingOptions
@@ -16,6 +15,7 @@ from bevcli.recording.log_static import RecordedBoxes
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import count_labels, open_sequence
+from bevcli.workshop.scores.config import ranges_m
 from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 
 MOST = 2  # models: each has a colour

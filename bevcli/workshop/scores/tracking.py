@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import MATCH_DISTANCE_M, ClassRanges, ranges_m
+from bevcli.geometry.matching import MATCH_DISTANCE_M
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import number
 from bevcli.workshop.scores.association import MATCH, MISS, SWITCH, TrackedBoxes, associate, near_pairs, scored_tracks
+from bevcli.workshop.scores.config import ClassRanges, ranges_m
 from bevcli.workshop.scores.inputs import Compared
 from bevcli.workshop.scores.tables import Cell, Table
 

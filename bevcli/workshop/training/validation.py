@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import MAP_CLASSES, Drive, Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import DetectionConfig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
@@ -31,6 +30,7 @@ from bevcli.printing import counted, one_line
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import count_labels, scenes_of
+from bevcli.workshop.scores.config import DetectionConfig
 from bevcli.workshop.scores.detection import evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, boxes_ego, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs
