@@ -13,7 +13,7 @@ from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.inference import PHOTOGRAPHS, ModelOptions
 from bevcli.options import Option
-from bevcli.printing import print_note, say
+from bevcli.printing import say
 from bevcli.recording import RecordingOptions
 from bevcli.runs import OutputOptions, RunOptions
 from bevcli.sequences.format import format_of
@@ -76,7 +76,7 @@ def run(
         from bevcli.workshop.calibration.in_turn import corrected
 
         drive = corrected(drive)
-    loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "", report=print_note)
+    loaded = loaded.in_engine(drive.rig, drive, parts="--probe" if recording.probes else "")
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     live = None
     if output.live:

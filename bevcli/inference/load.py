@@ -6,7 +6,7 @@ import platform
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -193,24 +193,16 @@ class Model:
         """SHA-256 of names, types, shapes and values of all weights."""
         return hash_of(self.network.state_dict().items())
 
-    def in_engine(
-        self,
-        rig: CameraRig,
-        drive: Drive | None = None,
-        *,
-        parts: str = "",
-        report: Callable[[str], None] = lambda note: None,
-    ) -> "Model":
+    def in_engine(self, rig: CameraRig, drive: Drive | None = None, *, parts: str = "") -> "Model":
         """The model in the engine that it was loaded for; one in PyTorch or an exported one is returned as it is.
 
         The first call exports the model for the number of cameras and the image size of the rig, and calibrates INT8 on
-        the first frames of a drive. The file is kept in the user's cache.
+        the first frames of a drive, and tells so in the log: it takes time. The file is kept in the user's cache.
 
         Args:
             rig: that it is to run on.
             drive: whose first frames calibrate INT8; None where there are no frames yet.
             parts: what looks into the network, such as "`probes`", which only PyTorch has.
-            report: called with a note before work that takes some time.
 
         Raises:
             BevcliError: `parts` are asked for in another engine, or the engine is not installed.
@@ -221,7 +213,7 @@ class Model:
             self.require_parts(parts)
         if not self.needs_export:
             return self
-        exported: Model = load("bevcli.engines", self.engine).export(self, rig, drive, report)
+        exported: Model = load("bevcli.engines", self.engine).export(self, rig, drive)
         return exported
 
     @cached_property

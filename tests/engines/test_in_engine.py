@@ -56,7 +56,8 @@ def steps(tmp_path_factory, network, drive, small_file, int8_file):
         patch.setattr(module, "quantize", calibrated)
         patch.setattr(module, "CALIBRATION_FRAMES", 2)
         seen = []
-        chosen(network, "openvino", "int8").in_engine(drive.rig, drive, report=seen.append)
+        patch.setattr(module, "_note", seen.append)
+        chosen(network, "openvino", "int8").in_engine(drive.rig, drive)
         yield seen
 
 
@@ -95,13 +96,12 @@ def test_a_processor_without_bfloat16_is_named(monkeypatch):
         load_model("demo", engine="openvino", precision="bf16")
 
 
-def test_the_first_time_says_what_it_does(steps, drive, network):
+def test_the_first_time_says_what_it_does(steps, drive, network, caplog):
     once = ", once for these weights, number of cameras and image size"
     expected = ["exporting small-for-tests for 2 cameras to openvino", "calibrating small-for-tests with memory"]
     assert steps == [f"{text}{once}" for text in expected]
-    again = []
-    found = chosen(network, "openvino", "int8").in_engine(drive.rig, drive, report=again.append)
-    assert again == []
+    found = chosen(network, "openvino", "int8").in_engine(drive.rig, drive)
+    assert caplog.messages == []
     assert (found.engine, found.precision, found.is_exported) == ("openvino", "int8", True)
     assert found.engine_note.startswith("engine openvino, int8, calibrated with memory; the exported file is /")
 

@@ -8,7 +8,7 @@ from bevcli.cli.bridge import Json, Part
 from bevcli.errors import BevcliError
 from bevcli.inference import ModelOptions, complete_model
 from bevcli.options import option, options
-from bevcli.printing import print_note, say
+from bevcli.printing import say
 from bevcli.registry import known_models
 
 PANEL = "Deploy"
@@ -63,7 +63,7 @@ def bench(
         model.require_parts(parts)
     if model.needs_export:
         drive = versions.MadeUpDrive(versions.CALIBRATION_FRAMES)
-        model = model.in_engine(drive.rig, drive, report=print_note)
+        model = model.in_engine(drive.rig, drive)
     against_plain = options.against == "plain"
     result = measure.run_benchmark(model, options.frames, against_plain=against_plain, profile_path=options.profile)
     say(json.dumps(result.as_data(), indent=1) if as_json else result.text())

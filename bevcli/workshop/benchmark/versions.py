@@ -31,7 +31,6 @@ from bevcli.model.network import Network, build_network
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel, model_class
 from bevcli.parsing.images import encode_image
-from bevcli.printing import print_note
 from bevcli.sequences.images import ImageReader, MessageSource
 from bevcli.workshop.engines.engine import CALIBRATION_FRAMES as CALIBRATION_FRAMES
 from bevcli.workshop.engines.exported import NEAR_M
@@ -361,7 +360,7 @@ def compare_engines(model: str, frames: int) -> EngineTable:
     for engine, precision in pairs:
         loaded = Model(network, engine=engine, precision=precision)
         try:
-            loaded = loaded.in_engine(drive.rig, drive, report=print_note)
+            loaded = loaded.in_engine(drive.rig, drive)
         except BevcliError as error:
             failed.append(EngineRow(engine, precision, problem=str(error)))
         else:

@@ -6,10 +6,11 @@ Files that nobody has used for some months are removed.
 """
 
 import importlib
+import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -34,6 +35,7 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.temporal_model import model_class
 from bevcli.parsing.files import MIB, hash_of_values, read_bytes
+from bevcli.printing import one_line
 from bevcli.sequences.images import AT_REST
 from bevcli.sequences.open import open_sequence, select_range
 from bevcli.workshop.engines import OnnxOptions
@@ -150,7 +152,7 @@ class Engine(LoadedFile):
         model_class(config).export_form(config, len(config.cameras))
 
     @classmethod
-    def export(cls, model: Model, rig: CameraRig, drive: Drive | None, report: Callable[[str], None]) -> Model:
+    def export(cls, model: Model, rig: CameraRig, drive: Drive | None) -> Model:
         """A model that is loaded for this engine, as an exported file for a rig: see `Model.in_engine`."""
         sized = model.for_rig(rig)
         options = _options(sized, rig, cls.deformable_convolution)
@@ -165,13 +167,13 @@ class Engine(LoadedFile):
             frames = _calibration_frames(model, drive) if is_int8 else None
             cached = exact.load(engine) if is_int8 else None
             if cached is None:
-                report(f"exporting {model.name} for {options.cameras} cameras to {model.engine}, {ONCE}")
+                _note(f"exporting {model.name} for {options.cameras} cameras to {model.engine}, {ONCE}")
                 labels = {"untrained": model.untrained, "bundled": model.bundled}
                 with exact.written() as path:
                     export_onnx(sized.network, path, options, contents=sized.contents(), **labels)
                 cached = exact.opened(engine)
             if frames is not None:
-                report(f"calibrating {model.name} with {frames.name}, {ONCE}")
+                _note(f"calibrating {model.name} with {frames.name}, {ONCE}")
                 images = calibration_images(sized.config, cached.network.cameras, [frames], CALIBRATION_FRAMES)
                 with file.written() as path:
                     quantize(exact.path, images, path)
@@ -179,6 +181,11 @@ class Engine(LoadedFile):
         calibrated = f", calibrated with {cached.calibrated_with}" if cached.calibrated_with else ""
         note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {file.path}"
         return replace(model, network=cached.network, file=file.path, engine_note=note)
+
+
+def _note(text: str) -> None:
+    """Tell that work begins which takes some time."""
+    logging.getLogger("bevcli").warning("note: %s", one_line(text))
 
 
 class OnnxRuntimeEngine(Engine):

@@ -54,7 +54,7 @@ def stress(
         drives = [bevcli.open_sequence(path, chosen, **format_options) for path in sequence or ()]
     else:
         drives = work.rendered_drives(drive_options, loaded.config, source)
-    loaded = loaded.in_engine(drives[0].rig, drives[0], report=print_note)
+    loaded = loaded.in_engine(drives[0].rig, drives[0])
     out = output.out or Path("runs") / f"stress-{loaded.name}"
     total = len(chosen_conditions) * sum(len(drive.stamps) for drive in drives)
     notes = [*why, *(note for drive in drives for note in drive.notes)]

@@ -125,7 +125,7 @@ def validate(
     drives = last_of_steps(work.drives_to_score(loaded.config, model or loaded.name, drive_options, options))
     notes = (*why, *validation.check_scored_drives(drive_options, drives, loaded.config))
     if loaded.needs_export:
-        loaded = loaded.in_engine(drives.open(0).rig, drives.open(0), report=print_note)
+        loaded = loaded.in_engine(drives.open(0).rig, drives.open(0))
         notes = (*notes, loaded.engine_note) if loaded.engine_note else notes
     total = work.count_frames(drives)
     if not work.has_ground_truth(drives):
