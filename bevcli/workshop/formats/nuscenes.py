@@ -150,7 +150,7 @@ class TableDrive(Drive):
             kinematics=kinematics.kinematics_at(entry.stamp.timestamp_ns),
             dropped=dropped,
             road_normal=motion.road_normal_at(entry.stamp.timestamp_ns),
-            ground_truth=None if sample is None else index.ground_truth(sample, self.dialect.class_of),
+            ground_truth=None if sample is None else index.ground_truth(sample, self.dialect),
             sample_token=None if sample is None else index.samples.tokens[sample].decode(),
         )
 

@@ -169,17 +169,12 @@ class NuScenesIndex:
     images: Images
     annotations: Annotations
 
-    def ground_truth(
-        self, sample: int, class_of: Callable[[str], str | None] = CLASS_OF_CATEGORY.get
-    ) -> Boxes3D | None:
-        """A sample's boxes in the world frame; None in a version without annotations.
-
-        class_of: a category -> its class, None for a category that is left out.
-        """
+    def ground_truth(self, sample: int, dialect: Dialect = NUSCENES) -> Boxes3D | None:
+        """A sample's boxes of the dialect's classes in the world frame; None in a version without annotations."""
         if not len(self.annotations.categories):
             return None
         rows = self._annotations_of(sample)
-        classes = [class_of(name.decode()) if name else None for name in self.annotations.categories[rows]]
+        classes = [dialect.class_of(name.decode()) if name else None for name in self.annotations.categories[rows]]
         kept = np.array([bool(name) for name in classes], dtype=bool)
         return self._boxes(rows[kept], [name for name in classes if name])
 
