@@ -1,7 +1,5 @@
 """BEV queries (paper, section 3.2): one learned vector a BEV cell, its position embedding, and the can-bus MLP."""
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor, nn
 
@@ -38,29 +36,3 @@ class BevQueries(nn.Module):
         x = self.column_embedding.expand(rows, -1, -1)
         y = self.row_embedding[:, None].expand(-1, columns, -1)
         return torch.cat([x, y], dim=-1).flatten(0, 1)
-
-    def resampled(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-        """A state dict whose BEV queries are interpolated to this grid, which covers the same area.
-
-        It is the same state dict where that holds no BEV queries or where these fit already.
-        prefix: of the keys of the BEV queries, such as "bev_queries.".
-        """
-        row_key, column_key, key = (f"{prefix}{name}" for name in ("row_embedding", "column_embedding", "embedding"))
-        if not {row_key, column_key, key} <= set(state):
-            return dict(state)
-        sizes = len(self.row_embedding), len(self.column_embedding)
-        file_sizes = len(state[row_key]), len(state[column_key])
-        if file_sizes == sizes or len(state[key]) != file_sizes[0] * file_sizes[1]:
-            return dict(state)
-        cells = state[key].float().unflatten(0, file_sizes).permute(2, 0, 1)[None]  # (1, C, rows, columns)
-        return {
-            **state,
-            key: nn.functional.interpolate(cells, sizes, mode="bilinear")[0].flatten(1).T,
-            row_key: _interpolated(state[row_key], sizes[0]),
-            column_key: _interpolated(state[column_key], sizes[1]),
-        }
-
-
-def _interpolated(rows: Tensor, count: int) -> Tensor:
-    """(N, C) -> (count, C), linearly."""
-    return nn.functional.interpolate(rows.float().T[None], count, mode="linear")[0].T

@@ -5,7 +5,7 @@ measured clockwise from -y: yaw = -angle - pi/2, with yaw counter-clockwise from
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -110,16 +110,6 @@ class Decoder(nn.Module):
     def fix_first_attention(self) -> None:
         """The queries attend to each other before they see the frame: computed once, in place of the first layer's."""
         self.layers[0].self_attention = ConstantSelfAttention(self.layers[0], self.object_queries(batch=1))
-
-    def first_queries(self, state: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-        """A state dict with the first queries of one that has more; the same where this decoder has several groups.
-
-        prefix: of the keys of the decoder, such as "decoder.".
-        """
-        key, count = f"{prefix}query_embedding", len(self.query_embedding)
-        if self.training_groups > 1 or key not in state or len(state[key]) <= count:
-            return dict(state)
-        return {**state, key: state[key][:count]}
 
     def object_queries(self, batch: int, groups: int = 1) -> ObjectQueries:
         """The learned queries of the first groups, the same for each batch element."""

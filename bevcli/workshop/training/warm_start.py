@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from bevcli.checkpoints import INTEGER_KEY, Checkpoint, read_checkpoint
 from bevcli.config import load_config
@@ -126,11 +126,8 @@ def warm_start(
     """
     checkpoint = read_checkpoint(file)
     start = WarmStart(file, checkpoint.facts.get("model") or " or ".join(checkpoint.models), model_file)
-    resampled, rows = (
-        model.bev_queries.resampled(checkpoint.state, "bev_queries."),
-        named_rows(checkpoint, model, drives),
-    )
-    state = model.decoder.first_queries(resampled, "decoder.")
+    resampled, rows = resampled_queries(model, checkpoint.state), named_rows(checkpoint, model, drives)
+    state = first_queries(model, resampled)
     reasons = dict.fromkeys(rows, "rows in the file's order")
     reasons |= {key: "interpolated from another grid" for key in state if resampled[key] is not checkpoint.state[key]}
     reasons |= {key: "the first queries of the file" for key in state if state[key] is not resampled[key]}
@@ -159,6 +156,40 @@ def warm_start(
         )
     model.load_state_dict(model_state)
     return start
+
+
+def resampled_queries(model: Network, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """A state dict whose BEV queries are interpolated to the grid of a model, which covers the same area.
+
+    It is the same state dict where that holds no BEV queries or where these fit already.
+    """
+    row_key, column_key, key = (f"bev_queries.{name}" for name in ("row_embedding", "column_embedding", "embedding"))
+    if not {row_key, column_key, key} <= set(state):
+        return state
+    sizes = len(model.bev_queries.row_embedding), len(model.bev_queries.column_embedding)
+    file_sizes = len(state[row_key]), len(state[column_key])
+    if file_sizes == sizes or len(state[key]) != file_sizes[0] * file_sizes[1]:
+        return state
+    cells = state[key].float().unflatten(0, file_sizes).permute(2, 0, 1)[None]  # (1, C, rows, columns)
+    return {
+        **state,
+        key: nn.functional.interpolate(cells, sizes, mode="bilinear")[0].flatten(1).T,
+        row_key: _interpolated(state[row_key], sizes[0]),
+        column_key: _interpolated(state[column_key], sizes[1]),
+    }
+
+
+def _interpolated(rows: Tensor, count: int) -> Tensor:
+    """(N, C) -> (count, C), linearly."""
+    return nn.functional.interpolate(rows.float().T[None], count, mode="linear")[0].T
+
+
+def first_queries(model: Network, state: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    """A state dict with the first queries of one that has more; the same where the model has several groups."""
+    key, count = "decoder.query_embedding", len(model.decoder.query_embedding)
+    if model.decoder.training_groups > 1 or key not in state or len(state[key]) <= count:
+        return state
+    return {**state, key: state[key][:count]}
 
 
 def _whole(start: WarmStart, key: str, tensor: Tensor, initial: Tensor, reason: str) -> Tensor:
