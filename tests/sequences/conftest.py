@@ -1,7 +1,6 @@
 """A small made-up drive, and real drives if the reference data is available."""
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -63,20 +62,13 @@ def edit(drive: Path) -> Callable[[str, str, str], Path]:
     return replace
 
 
-def _shared(part: str) -> Path:
-    root = os.environ.get("BEVCLI_SHARED")
-    if not root:
-        pytest.skip("BEVCLI_SHARED does not name the folder with the reference data")
-    return Path(root) / "data" / part
-
-
 @pytest.fixture
-def real_drive() -> Path:
+def real_drive(shared: Path) -> Path:
     """The real nuScenes drive as a native folder: four keyframes, six cameras."""
-    return _shared("nuscenes-scene-0103")
+    return shared / "data/nuscenes-scene-0103"
 
 
 @pytest.fixture
-def nuscenes_root() -> Path:
+def nuscenes_root(shared: Path) -> Path:
     """The same four keyframes as a nuScenes dataset root."""
-    return _shared("nuscenes-mini-4")
+    return shared / "data/nuscenes-mini-4"

@@ -2,7 +2,6 @@
 
 import json
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -48,11 +47,10 @@ def read(path, drive=STREET, **how):
 
 def written(folder, content, name="rig.yaml"):
     path = folder / name
-    text = content if isinstance(content, str) else json.dumps(content)
     path.parent.mkdir(exist_ok=True, parents=True)
-    path.write_text(
-        text if path.suffix != ".yaml" or isinstance(content, str) else yaml.safe_dump(content, sort_keys=False)
-    )
+    if not isinstance(content, str):
+        content = yaml.safe_dump(content, sort_keys=False) if path.suffix == ".yaml" else json.dumps(content)
+    path.write_text(content)
     return path
 
 
@@ -107,8 +105,10 @@ SPELLINGS = {
 }
 
 
-@pytest.mark.parametrize("spelling", SPELLINGS)
-@pytest.mark.parametrize("layout", ["mapping", "list", "folder"])
+@pytest.mark.parametrize(
+    ("layout", "spelling"),
+    [*(("mapping", spelling) for spelling in SPELLINGS), ("list", "T_cam_ego"), ("folder", "quaternion")],
+)
 def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
     cameras = {name: SPELLINGS[spelling](name) for name in NAMES}
     if layout == "mapping":
@@ -121,9 +121,8 @@ def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
     assert_is_the_street(found.rig, lens=True)
     assert found.rig[NAMES[0]].distortion.coefficients == tuple(D)
     [line] = found.notes
-    direction = (
-        "camera_from_ego" if spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec") else "ego_from_camera"
-    )
+    inverted = spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec")
+    direction = "camera_from_ego" if inverted else "ego_from_camera"
     assert re.search(f"{direction}, .*camera axes {'x forward' if 'axes' in spelling else 'x right'}", line)
 
 
@@ -133,13 +132,8 @@ def test_files_that_opencv_writes(tmp_path, suffix):
         path = tmp_path / "rig" / f"{name}{suffix}"
         path.parent.mkdir(exist_ok=True)
         file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-        for key, value in {
-            "camera_matrix": k_of(name),
-            "distortion_coefficients": np.array([D]).T,
-            "T": pose(name),
-        }.items():
-            file.write(key, value)
-        for key, value in {"image_width": SIZE[0], "image_height": SIZE[1]}.items():
+        values = {"camera_matrix": k_of(name), "distortion_coefficients": np.array([D]).T, "T": pose(name)}
+        for key, value in {**values, "image_width": SIZE[0], "image_height": SIZE[1]}.items():
             file.write(key, value)
         file.release()
     assert_is_the_street(read(tmp_path / "rig", None).rig, lens=True)
@@ -177,9 +171,8 @@ body_T_cam0: !!opencv-matrix {{rows: 4, cols: 4, dt: d, data: {pose}}}
 def test_files_of_other_programs_for_one_camera(tmp_path, text):
     name = NAMES[1]
     values = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"), [*four(name), *D[:4]], strict=True))
-    lines = "\n".join(
-        f"Camera.{key}: {value}" for key, value in {**values, "width": SIZE[0], "height": SIZE[1]}.items()
-    )
+    values |= {"width": SIZE[0], "height": SIZE[1]}
+    lines = "\n".join(f"Camera.{key}: {value}" for key, value in values.items())
     facts = {"pose": pose(name).ravel().tolist(), "inverse": np.linalg.inv(pose(name)).tolist(), "lines": lines}
     text = text.format(**facts, size=SIZE, four=four(name))
     [camera] = read(written(tmp_path, text, "front.yaml"), None).rig.cameras
@@ -188,22 +181,6 @@ def test_files_of_other_programs_for_one_camera(tmp_path, text):
     assert camera.distortion.coefficients == tuple(D[:4])
     np.testing.assert_allclose(camera.intrinsics, k_of(name))
     np.testing.assert_allclose(camera.ego_from_camera, pose(name), atol=1e-9)
-
-
-def test_kalibr_and_poses_of_another_file(tmp_path):
-    chain = {
-        name: {
-            "camera_model": "pinhole", "distortion_model": "radtan", "distortion_coeffs": D[:4],
-            "resolution": list(SIZE),
-            "intrinsics": four(name), "T_cam_imu": np.eye(4).tolist(),
-        }
-        for name in NAMES
-    }  # fmt: skip
-    for earlier, name in pairwise(NAMES):
-        chain[name]["T_cn_cnm1"] = (np.linalg.inv(pose(name)) @ pose(earlier)).tolist()
-    poses = written(tmp_path, {NAMES[2]: {"T_ego_cam": pose(NAMES[2]).tolist()}}, "poses.yaml")
-    found = read(written(tmp_path, chain, "camchain.yaml"), None, extrinsics=poses)
-    assert_is_the_street(found.rig, lens=True)
 
 
 def colmap(folder, poses):
@@ -226,51 +203,24 @@ def test_colmap(tmp_path):
     found = read(colmap(tmp_path, {name: [np.linalg.inv(pose(name))] * 2 for name in NAMES}))
     assert_is_the_street(found.rig, lens=True)
     assert "camera_from_ego" in found.notes[0]
-
-
-def test_a_reconstruction_of_a_drive_has_no_poses_on_the_vehicle(tmp_path):
-    moving = {name: [np.linalg.inv(pose(name)), np.eye(4)] for name in NAMES}
-    folder = colmap(tmp_path, moving)
+    # A reconstruction of a drive has no poses on the vehicle.
+    folder = colmap(tmp_path, {name: [np.linalg.inv(pose(name)), np.eye(4)] for name in NAMES})
     with pytest.raises(InputError, match=r"moves through the file.*`--extrinsics FILE`"):
         read(folder)
     poses = written(tmp_path, {name: {"ego_from_camera": pose(name).tolist()} for name in NAMES}, "poses.json")
     assert_is_the_street(read(folder, extrinsics=poses).rig, lens=True)
 
 
-def test_nerfstudio(tmp_path):
-    frames = [
-        {
-            "file_path": f"images/{name}/000000.jpg", "transform_matrix": pose(name, axes=OPENGL).tolist(),
-            **dict(zip(("fl_x", "fl_y", "cx", "cy"), np.array(four(name)) + [0, 0, 0.5, 0.5], strict=True)),
-        }
-        for name in NAMES
-    ]  # fmt: skip
-    path = written(
-        tmp_path, {"camera_model": "OPENCV", "w": SIZE[0], "h": SIZE[1], "frames": frames}, "transforms.json"
-    )
-    assert_is_the_street(read(path, None).rig)
-    assert_is_the_street(bevcli.read_calibration(path))
-
-
-@pytest.mark.parametrize("kind", ["objects", "raw"])
-def test_kitti(tmp_path, kind):
+def test_kitti(tmp_path):
     """The drawing of the vehicle: cameras 1.65 m above the road; the Velodyne 1.73 m, and 0.27 m behind them."""
     k = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
-    rows = {"P2" if kind == "objects" else "P_rect_02": k @ np.c_[np.eye(3), [0.06, 0, 0]]}
-    camera_from_velodyne = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
-    if kind == "objects":
-        rows |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": camera_from_velodyne}
-    else:
-        rows |= {"S_rect_02": np.array([1242.0, 375.0]), "R_rect_00": np.eye(3)}
-        text = "calib_time: 09-Jan-2012\n" + lines_of(
-            {"R": camera_from_velodyne[:, :3], "T": camera_from_velodyne[:, 3]}
-        )
-        written(tmp_path, text, "calib_velo_to_cam.txt")
-    path = written(tmp_path, lines_of(rows), "000000.txt" if kind == "objects" else "calib_cam_to_cam.txt")
+    rows = {"P2": k @ np.c_[np.eye(3), [0.06, 0, 0]], "R0_rect": np.eye(3)}
+    rows["Tr_velo_to_cam"] = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
+    path = written(tmp_path, lines_of(rows), "000000.txt")
     images = tmp_path / "images" / "image_2"
     images.mkdir(parents=True)
     cv2.imwrite(str(images / "0.png"), np.zeros((375, 1242, 3), np.uint8))
-    [camera] = read(path if kind == "objects" else tmp_path, tmp_path).rig.cameras
+    [camera] = read(path, tmp_path).rig.cameras
     assert (camera.width, camera.height) == (1242, 375)
     np.testing.assert_allclose(camera.intrinsics, k)
     np.testing.assert_allclose(camera.ego_from_camera[:3, 3], [0.76 + 0.27, 0.06, 1.65], atol=1e-9)
@@ -396,7 +346,7 @@ def scaled(matrix, factors):
     return [(np.array(row) * factors).tolist() for row in matrix[:3]]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_drawn_rigs_are_among_the_readings_both_ways(tmp_path, seed):
     """A whole rig under a name that states nothing; each camera alone under one that states the direction."""
     cameras = draw_rig(RigDistribution(), seed, SIZE).rig.cameras
@@ -410,7 +360,7 @@ def test_real_rigs_are_among_the_readings_both_ways(shared, tmp_path):
 
 
 def assert_among_the_readings(folder, cameras):
-    for rig in (cameras, *((camera,) for camera in cameras)):
+    for rig in (cameras, *((camera,) for camera in cameras[:2])):
         for name, stated in (("T_ego_cam", np.array), ("T_cam_ego", np.linalg.inv)):
             key = name if len(rig) == 1 else "T"
             entries = {

@@ -43,9 +43,8 @@ def classes(sequence) -> list[str]:
 def test_names_ignore_case_and_unknown_ones_are_named_once(labelled: Path) -> None:
     sequence = open_sequence(labelled)
     assert classes(sequence) == ["car", "truck", "Tricycle", "lorry", "pedestrian"]
-    notes = [note for note in sequence.notes if "other classes" in note]
-    assert len(notes) == 1
-    assert "8 boxes have other classes and are not scored: Tricycle (4), lorry (4)" in notes[0]
+    [note] = [note for note in sequence.notes if "other classes" in note]
+    assert "8 boxes have other classes and are not scored: Tricycle (4), lorry (4)" in note
 
 
 def test_a_class_map_renames_without_case(labelled: Path) -> None:

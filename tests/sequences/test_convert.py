@@ -37,9 +37,8 @@ def test_missing_images_and_camera_order_are_kept(edit, tmp_path):
         assert a.rig.names == b.rig.names
         for camera, image in a.images.items():
             assert image.encoded == b.images[camera].encoded
-            np.testing.assert_allclose(
-                a.world_from_ego_at[camera].matrix, b.world_from_ego_at[camera].matrix, atol=1e-9
-            )
+            one_pose, other_pose = (frame.world_from_ego_at[camera].matrix for frame in (a, b))
+            np.testing.assert_allclose(one_pose, other_pose, atol=1e-9)
         np.testing.assert_allclose(a.kinematics.velocity, b.kinematics.velocity, atol=1e-12)
 
 
