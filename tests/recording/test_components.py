@@ -13,6 +13,8 @@ COLORS = RANDOM.integers(0, 256, (5, 3)).astype(np.uint8)
 WITH_OPACITY = RANDOM.integers(0, 256, (5, 4)).astype(np.uint8)
 IMAGE = RANDOM.integers(0, 256, (6, 4, 3)).astype(np.uint8)
 POSE = RANDOM.normal(size=(3, 3))
+BOXES = {"centers": POINTS_3D, "half_sizes": POINTS_3D, "quaternions": WITH_OPACITY / 255}
+BOXES |= {"fill_mode": "majorwireframe"}
 RADIUS = rr.Radius.ui_points(1.5)
 
 
@@ -40,23 +42,7 @@ def rows(made):
             rr.Points2D(POINTS_2D, labels=["ä", "", "car", "a", "b"], colors=(1, 2, 3), show_labels=True),
         ),
         (rr.Points2D, {"positions": POINTS_2D, "colors": packed(COLORS)}, rr.Points2D(POINTS_2D, colors=COLORS)),
-        (
-            rr.Boxes3D,
-            {
-                "centers": POINTS_3D,
-                "half_sizes": POINTS_3D,
-                "quaternions": WITH_OPACITY / 255,
-                "class_ids": np.arange(5),
-                "fill_mode": "majorwireframe",
-            },
-            rr.Boxes3D(
-                centers=POINTS_3D,
-                half_sizes=POINTS_3D,
-                quaternions=WITH_OPACITY / 255,
-                class_ids=range(5),
-                fill_mode="majorwireframe",
-            ),
-        ),
+        (rr.Boxes3D, BOXES | {"class_ids": np.arange(5)}, rr.Boxes3D(**BOXES, class_ids=range(5))),
         (
             rr.Arrows3D,
             {"vectors": POINTS_3D, "origins": POINTS_3D, "colors": None},

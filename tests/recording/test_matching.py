@@ -20,21 +20,6 @@ def boxes(places, classes, scores=None) -> Boxes3D:
     return Boxes3D(centers, np.ones((count, 3)), np.zeros(count), np.zeros((count, 2)), np.array(classes), score_array)
 
 
-def test_a_box_is_found_within_two_metres_and_its_class():
-    truth = boxes([(0, 0), (10, 0), (20, 0)], ["car", "car", "bus"])
-    predicted = boxes([(0, 1.9), (10, 2.1), (20, 0)], ["car", "car", "car"], [0.9, 0.8, 0.7])
-    true, found = true_positives(predicted, truth)
-    assert true.tolist() == [True, False, False]
-    assert found.tolist() == [True, False, False]
-
-
-def test_a_box_is_found_once_by_the_highest_score():
-    truth = boxes([(0, 0)], ["car"])
-    true, found = true_positives(boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.3, 0.9]), truth)
-    assert true.tolist() == [False, True]
-    assert found.tolist() == [True]
-
-
 def test_truth_outside_grid_or_without_points_is_undetectable():
     truth = replace(boxes([(0, 0), (1, 1), (80, 0)], ["car"] * 3), num_points=np.array([5, 0, 5]))
     assert detectable(truth, BevGrid(50, 50)).centers[:, 0].tolist() == [0]
@@ -54,30 +39,36 @@ def evaluated(predicted, truth):
     )
 
 
-def test_at_exactly_two_metres_display_agrees_with_evaluation():
-    truth = boxes([(0, 0), (10, 0)], ["car", "car"])
-    predicted = boxes([(0, 2.0), (10, np.nextafter(2.0, 0))], ["car", "car"], [0.9, 0.8])
-    true, found = true_positives(predicted, truth)
-    assert true.tolist() == found.tolist() == [False, True]
-    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
-
-
-def test_of_equal_scores_the_display_chooses_as_the_evaluation():
-    truth = boxes([(0, 0)], ["car"])
-    predicted = boxes([(0.1, 0), (0.5, 0)], ["car", "car"], [0.7, 0.7])
-    true, found = true_positives(predicted, truth)
-    assert true.tolist() == [False, True]  # the later one, as in the devkit
-    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
+@pytest.mark.parametrize(
+    ("truth", "predicted", "true", "found"),
+    [
+        (  # within two metres, and its class
+            boxes([(0, 0), (10, 0), (20, 0)], ["car", "car", "bus"]),
+            boxes([(0, 1.9), (10, 2.1), (20, 0)], ["car"] * 3, [0.9, 0.8, 0.7]),
+            [True, False, False], [True, False, False],
+        ),
+        (boxes([(0, 0)], ["car"]), boxes([(0.1, 0), (0.5, 0)], ["car"] * 2, [0.3, 0.9]), [False, True], [True]),
+        (  # at exactly two metres
+            boxes([(0, 0), (10, 0)], ["car"] * 2),
+            boxes([(0, 2.0), (10, np.nextafter(2.0, 0))], ["car"] * 2, [0.9, 0.8]),
+            [False, True], [False, True],
+        ),
+        # Of equal scores the later one, as in the devkit.
+        (boxes([(0, 0)], ["car"]), boxes([(0.1, 0), (0.5, 0)], ["car"] * 2, [0.7, 0.7]), [False, True], [True]),
+    ],
+)  # fmt: skip
+def test_boxes_are_found_as_the_evaluation_does(truth, predicted, true, found):
+    assert [part.tolist() for part in true_positives(predicted, truth)] == [true, found]
+    assert evaluated(predicted, truth) == (true, found)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_display_agrees_with_the_evaluation(seed):
     rng = np.random.default_rng(seed)
     names = np.array(["car", "bus", "pedestrian"])
-    truth = boxes(rng.integers(0, 8, (25, 2)) + rng.uniform(0, 1e-6, (25, 2)), rng.choice(names, 25))
-    predicted = boxes(
-        rng.integers(0, 8, (60, 2)) + rng.uniform(0, 1e-6, (60, 2)), rng.choice(names, 60), rng.integers(1, 5, 60) / 5
-    )
+    places = [rng.integers(0, 8, (count, 2)) + rng.uniform(0, 1e-6, (count, 2)) for count in (25, 60)]
+    truth = boxes(places[0], rng.choice(names, 25))
+    predicted = boxes(places[1], rng.choice(names, 60), rng.integers(1, 5, 60) / 5)
     true, found = true_positives(predicted, truth)
     assert true.any()
     assert not true.all()

@@ -27,6 +27,9 @@ CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS
 
 
+NAMES = ("a",), ("a", "b")
+
+
 class Labelled(MemoryDrive):
     """A drive with a car, and with a bicycle that `boxes_of` does not have."""
 
@@ -112,6 +115,12 @@ def test_beyond_the_range_of_its_class_nothing_is_missed(tmp_path):
 
 def test_frames_of_a_submission_are_matched_by_token(tmp_path):
     """Of a frame that the file lacks, no label is missed, and no trail of the frame before stays."""
+    drive = Labelled(2)
+    tracked = replace(boxes_of(drive, 0), instances=np.array(["1", "2", "3"]))
+    write_boxes(BoxesFile("world", (FrameBoxes(drive.stamps[0], drive.pose(0), tracked),)), tmp_path / "a.json")
+    first, last = frames_of(record(drive, tmp_path / "a.json", tmp_path / "a.rrd"))
+    assert entities.track("car", "1") in first.rows
+    assert entities.track("car", "1") not in last.rows
     drive = Labelled(3)
     write_submission(boxes_file(drive, range(2)), tmp_path / "results_nusc.json")
     lines = lines_of(drive, tmp_path / "results_nusc.json", tmp_path / "r.rrd")
@@ -133,16 +142,6 @@ def test_boxes_of_another_drive_are_told(tmp_path):
     lines = lines_of(drive, tmp_path / "a.json", tmp_path / "r.rrd")
     assert lines[0] == "a: has boxes of 1 of 1 frame, matched by frame index, as scenes or times differ"
     assert re.fullmatch(r"warning: a: the nearest box is 19\d\d m from the vehicle: is it of this drive\?", lines[1])
-
-
-def test_trails_end_where_a_file_lacks_a_frame(tmp_path):
-    drive = Labelled(2)
-    tracked = [replace(boxes_of(drive, 0), instances=np.array(["1", "2", "3"]))]
-    frames = BoxesFile("world", (FrameBoxes(drive.stamps[0], drive.pose(0), tracked[0]),))
-    write_boxes(frames, tmp_path / "a.json")
-    first, last = frames_of(record(drive, tmp_path / "a.json", tmp_path / "r.rrd"))
-    assert entities.track("car", "1") in first.rows
-    assert entities.track("car", "1") not in last.rows
 
 
 @pytest.fixture(scope="module")
@@ -189,34 +188,24 @@ def test_the_summary_and_the_video_name_both_models(two):
         assert near[500:, :1280].sum() > 150  # the legend
     with pytest.raises(InputError, match="compares a/b c and new"):
         read_recording(two)
+    recorded = {names: Recorded(MemoryDrive(1), RecordedBoxes(names), RecordingOptions()) for names in ((), *NAMES)}
+    texts = {names: [text for text, _ in legend_entries(made)] for names, made in recorded.items()}
+    assert texts["a", "b"] == ["a", "b", "ground truth"]
+    assert {"car", "ground truth", "missed, false"} <= set(texts["a",])
+    assert "ground truth" not in texts[()]
 
 
-def test_the_legend_names_what_is_drawn():
-    def legend(boxes):
-        return [text for text, _ in legend_entries(Recorded(MemoryDrive(1), boxes, RecordingOptions()))]
-
-    assert legend(RecordedBoxes(("a", "b"))) == ["a", "b", "ground truth"]
-    assert {"car", "ground truth", "missed, false"} <= set(legend(RecordedBoxes(("a",))))
-    assert "ground truth" not in legend(RecordedBoxes())
-
-
-def test_labels_of_any_class_have_a_colour(tmp_path):
-    drive = Labelled(1)
-    frame = drive.load(0)
-    truth = replace(frame.ground_truth, classes=np.array(["Straßenbahn", "car"]))
-    drive.load = lambda place: replace(frame, ground_truth=truth)  # type: ignore[method-assign]
-    [read] = frames_of(record(drive, path=tmp_path / "r.rrd"))
-    assert read.texts(entities.RUN, "class_names")[-1] == "Straßenbahn"
-    assert read.integers(entities.BOXES, "Boxes3D:class_ids") == [11, 1]
-
-
-def test_a_labelled_map_lies_on_the_ground(tmp_path):
+def test_labelled_maps_and_classes_of_any_name_are_shown(tmp_path):
     drive = Labelled(2)
     frames = [drive.load(place) for place in range(2)]
-    frames[0] = replace(frames[0], ground_truth_map=BevMap(np.ones((4, 4), np.uint8), (-8, 8), (-8, 8), {"road": 1}))
+    truth = replace(frames[0].ground_truth, classes=np.array(["Straßenbahn", "car"]))
+    road = BevMap(np.ones((4, 4), np.uint8), (-8, 8), (-8, 8), {"road": 1})
+    frames[0] = replace(frames[0], ground_truth=truth, ground_truth_map=road)
     drive.load = lambda place: frames[place]  # type: ignore[method-assign]
     first, last = frames_of(record(drive, path=tmp_path / "r.rrd"))
     assert first.texts(entities.RUN, "map_classes") == ["road"]
+    assert first.texts(entities.RUN, "class_names")[-1] == "Straßenbahn"
+    assert first.integers(entities.BOXES, "Boxes3D:class_ids") == [11, 1]
     assert first.has(entities.BEV_SEGMENTATION, "Image:buffer")
     assert not last.has(entities.BEV_SEGMENTATION, "Image:buffer")
 

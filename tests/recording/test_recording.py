@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemoryDrive, WithoutImages
+from memory_drive import MemoryDrive, WithoutImages, make_rig
 from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
 
 from bevcli.cli.run import _frame_warnings
@@ -18,6 +18,8 @@ from bevcli.geometry.transforms import Pose
 from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
+
+ONE = make_rig({"CAM_FRONT": 0.0})
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +32,24 @@ def standard(tmp_path_factory):
 
 def entity_rows(path: Path, entity: str) -> list[tuple[bool, int]]:
     return [(c.is_static, c.num_rows) for c in RecordingReader(path).chunks() if c.entity_path == f"/{entity}"]
+
+
+class UtmDrive(MemoryDrive):
+    """Far from the origin of the world."""
+
+    def pose(self, index: int) -> Pose:
+        near = super().pose(index)
+        return Pose(near.translation + [654321.0, 5345678.0, 512.0], near.quaternion)
+
+
+def test_a_minimal_recording_has_boxes_anywhere_and_no_internals(tmp_path):
+    frames = record(tmp_path / "utm.rrd", UtmDrive(2, ONE), RecordingOptions(level="minimal"))
+    *_, last = RecordingReader(tmp_path / "utm.rrd").frames()
+    back = recorded_boxes(last).boxes.transformed(bev_from_world(frames[-1]))
+    np.testing.assert_allclose(back.centers, boxes_ahead()[:2].centers, atol=1e-3)
+    assert not {entities.BEV_FEATURES, entities.BEV_ON_GROUND, entities.PILLARS, entities.BEV_HISTORY} & set(last.rows)
+    with pytest.raises(OutputError, match=r"r\.rrd"), Recording(tmp_path / "no/r.rrd", UtmDrive(1), NamedModel()):
+        pass
 
 
 def test_boxes_come_back_in_the_world(standard):
@@ -47,18 +67,6 @@ def test_boxes_come_back_in_the_world(standard):
         np.testing.assert_allclose(np.cos(back.yaws - shown.yaws), 1, atol=1e-6)
         np.testing.assert_allclose(back.velocities, shown.velocities, atol=1e-5)
         np.testing.assert_allclose(back.scores, shown.scores)
-
-
-def test_boxes_far_from_the_origin_keep_millimetres(tmp_path):
-    class UtmDrive(MemoryDrive):
-        def pose(self, index: int) -> Pose:
-            near = super().pose(index)
-            return Pose(near.translation + [654321.0, 5345678.0, 512.0], near.quaternion)
-
-    frames = record(tmp_path / "utm.rrd", UtmDrive(2))
-    last = list(RecordingReader(tmp_path / "utm.rrd").frames())[-1]
-    back = recorded_boxes(last).boxes.transformed(bev_from_world(frames[-1]))
-    np.testing.assert_allclose(back.centers, boxes_ahead()[:2].centers, atol=1e-3)
 
 
 def test_ground_truth_is_divided_into_found_and_missed(standard):
@@ -105,13 +113,17 @@ def test_static_entities_are_written_once(standard):
 
 def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
     """Each camera has its own time: the vehicle stood 2 m farther back when CAM_FRONT took its image."""
-    drive = MemoryDrive(1)
+    drive = MemoryDrive(1, ONE)
     frame = drive.load(0)
+    image = frame.images["CAM_FRONT"]
+    jpeg = cv2.imencode(".jpg", image.pixels_bgr)[1].tobytes()
+    own = CameraImage(image.timestamp_ns, image.pixels_bgr, jpeg, "image/jpeg")
     earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
-    frame = replace(frame, world_from_ego_at={**frame.world_from_ego_at, "CAM_FRONT": earlier})
+    frame = replace(frame, images={"CAM_FRONT": own}, world_from_ego_at={"CAM_FRONT": earlier})
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, predict(frame))
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert read.blob(entities.image("CAM_FRONT"), "EncodedImage:blob") == jpeg  # the bytes of a file are kept
     color = 0xFF9E2CFF  # the car's
     colors = np.array(read.values(entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:colors"))
     strips = np.array(read.values(entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:strips"))[colors == color]
@@ -122,32 +134,15 @@ def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
     np.testing.assert_allclose(strips[..., 0].min(), middle - half, atol=0.1)
 
 
-def test_the_encoded_bytes_of_an_image_file_are_kept(tmp_path):
-    drive = MemoryDrive(1)
-    frame = drive.load(0)
-    image = frame.images["CAM_FRONT"]
-    jpeg = cv2.imencode(".jpg", image.pixels_bgr)[1].tobytes()
-    own = CameraImage(image.timestamp_ns, image.pixels_bgr, jpeg, "image/jpeg")
-    frame = replace(frame, images={**frame.images, "CAM_FRONT": own})
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(frame, predict(frame))
-    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert read.blob(entities.image("CAM_FRONT"), "EncodedImage:blob") == jpeg
-
-
 def test_a_dropped_image_clears_the_view_and_logs_an_event(tmp_path):
-    record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK",)}, count=3))
+    record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_BACK", "CAM_FRONT")}, count=3))
     recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
     shown = [bool(frame.blob(entities.image("CAM_BACK"), "EncodedImage:blob")) for frame in recorded]
     assert shown == [True, False, True]
     texts = [frame.texts(entities.overlay("CAM_BACK", entities.NO_IMAGE), "Points2D:labels") for frame in recorded]
     assert texts == [[], ["CAM_BACK: no image"], []]
-    assert recorded[1].values(entities.EVENTS, "TextLog:text") == ["frame 1: camera CAM_BACK has no image: missing"]
-
-
-def test_no_box_is_drawn_where_a_camera_has_no_image(tmp_path):
-    record(tmp_path / "r.rrd", WithoutImages({1: ("CAM_FRONT",)}, count=3))
-    recorded = list(RecordingReader(tmp_path / "r.rrd").frames())
+    said = [f"frame 1: camera {name} has no image: missing" for name in ("CAM_BACK", "CAM_FRONT")]
+    assert [text for text in events(tmp_path / "r.rrd") if "has no image" in text] == said
     for kind in ("boxes", "ground_truth"):
         drawn = [len(frame.strips(entities.overlay("CAM_FRONT", kind), "LineStrips2D:strips")) for frame in recorded]
         assert drawn[0] == drawn[2] > drawn[1] == 0
@@ -155,7 +150,7 @@ def test_no_box_is_drawn_where_a_camera_has_no_image(tmp_path):
 
 
 def test_a_frame_without_results_shows_none_of_the_one_before(tmp_path):
-    drive = MemoryDrive(4)
+    drive = MemoryDrive(4, ONE)
     ground_map = BevMap(np.ones((4, 4), np.uint8), (-10, 10), (-10, 10))
     with Recording(tmp_path / "r.rrd", drive, NamedModel(), RecordingOptions(probes=((0, 10),))) as recording:
         for frame in map(drive.load, range(4)):
@@ -176,7 +171,7 @@ def test_a_frame_without_results_shows_none_of_the_one_before(tmp_path):
 
 
 def test_a_recording_of_an_untrained_model_is_labelled(tmp_path):
-    record(tmp_path / "r.rrd", MemoryDrive(1), untrained=True)
+    record(tmp_path / "r.rrd", MemoryDrive(1, ONE), untrained=True)
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
     assert frame.values(entities.RUN, "untrained") == [True]
     assert "untrained" in frame.values(entities.RUN, "TextDocument:text")[0]
@@ -190,14 +185,18 @@ def events(path: Path) -> list[str]:
 
 
 def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
-    drive = MemoryDrive(4, scenes="aabb")
+    drive = MemoryDrive(4, ONE, scenes="aabb")
     first, new = NewStart(StartReason.FIRST_FRAME), NewStart(StartReason.NEW_SCENE)
     reasons = (first, None, new, NewStart(StartReason.GAP, 9.0))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
+        recording.event("a note", "WARN")
         for place in range(4):
             frame = drive.load(place)
             recording.log(frame, replace(predict(frame), started_anew=reasons[place]))
+    read = next(RecordingReader(tmp_path / "r.rrd").frames())
+    assert read.has(entities.EVENTS, "TextLog:text")  # also those before the first frame have a timestamp
     assert events(tmp_path / "r.rrd") == [
+        "a note",
         'frame 0: no history: first frame, scene "a"',
         'frame 2: no history: new scene, scene "b"',
         'frame 3: no history: gap of 9.0 s, scene "b"',
@@ -206,20 +205,13 @@ def test_the_reason_of_a_restart_without_history_is_an_event(tmp_path):
 
 @pytest.mark.parametrize("changes", [{"skipped": True}, {"not_finite": "neck"}], ids=["skipped", "not finite"])
 def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes):
-    drive = MemoryDrive(1, scenes=[""])
+    drive = MemoryDrive(1, ONE, scenes=[""])
     frame = drive.load(0)
     gap = NewStart(StartReason.GAP, 2.5)
     failed = replace(predict(frame), boxes=Boxes3D.empty(), bev=None, started_anew=gap, **changes)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, failed)
     assert sorted(events(tmp_path / "r.rrd")) == sorted(_frame_warnings(frame, failed, standing=None))
-
-
-def test_a_minimal_recording_has_no_internals(tmp_path):
-    record(tmp_path / "r.rrd", MemoryDrive(2), RecordingOptions(level="minimal"))
-    *_, last = RecordingReader(tmp_path / "r.rrd").frames()
-    assert not {entities.BEV_FEATURES, entities.BEV_ON_GROUND, entities.PILLARS, entities.BEV_HISTORY} & set(last.rows)
-    assert last.has(entities.BOXES, "Boxes3D:centers")
 
 
 def test_a_frame_adds_at_most_400_kb(standard):
@@ -236,7 +228,7 @@ def test_a_frame_adds_at_most_400_kb(standard):
 @pytest.mark.filterwarnings("error")
 def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN_STRICT", "1")
-    drive = MemoryDrive(2)
+    drive = MemoryDrive(2, ONE)
     first, second = (with_truth(drive.load(place)) for place in range(2))
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(first, predict(first))
@@ -246,24 +238,6 @@ def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
     assert last.values(entities.GROUND_TRUTH, "name") == []
     for entity in (entities.BEV_BOXES, entities.overlay("CAM_FRONT", "boxes")):
         assert last.values(entity, "LineStrips2D:strips") == []
-
-
-def test_events_before_the_first_frame_are_kept(tmp_path):
-    drive = MemoryDrive(1)
-    frame = with_truth(drive.load(0))
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.event("a note", "WARN")
-        recording.log(frame, predict(frame))
-    assert events(tmp_path / "r.rrd")[0] == "a note"
-    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert read.has(entities.EVENTS, "TextLog:text")  # it has a timestamp
-
-
-def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
-    drive = MemoryDrive(1)
-    recording = Recording(tmp_path / "no" / "r.rrd", drive, NamedModel())
-    with pytest.raises(OutputError, match=r"r\.rrd"), recording:
-        pass
 
 
 @pytest.mark.slow

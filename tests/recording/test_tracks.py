@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rerun as rr
-from memory_drive import MemoryDrive
+from memory_drive import MemoryDrive, make_rig
 from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
 
 from bevcli.recording import entities
@@ -14,12 +14,13 @@ from bevcli.recording.log_cameras import box_labels
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 
+ONE = make_rig({"CAM_FRONT": 0.0})
 CAR, PEDESTRIAN = entities.track("car", "7"), entities.track("pedestrian", "8")
 
 
 def record_tracks(path, count: int, instances, scenes: str = "a" * 30):
     """A recording whose three boxes have these instances, by frame; returns its frames as read."""
-    drive = MemoryDrive(count, scenes=scenes)
+    drive = MemoryDrive(count, ONE, scenes=scenes)
     with Recording(path, drive, NamedModel()) as recording:
         for place in range(count):
             frame = drive.load(place)
@@ -41,11 +42,9 @@ def test_a_track_has_its_past_and_the_next_second(tmp_path):
         np.testing.assert_allclose(ahead[1, :2] - ahead[0, :2], car.velocity * AHEAD_S, atol=1e-4)
         np.testing.assert_allclose(ahead[0, :2], (car.center - origin)[:2], atol=1e-4)
         assert [len(strip) for strip in past] == ([place + 1] if place else [])
-    assert frames[-1].values(CAR, "track") == ["7"]
-
-
-def test_only_shown_boxes_with_a_track_have_a_trail(tmp_path):
-    *_, last = record_tracks(tmp_path / "r.rrd", 2, lambda place: ["7", "", "9"])
+    last = frames[-1]
+    assert last.values(CAR, "track") == ["7"]
+    assert recorded_boxes(last).boxes.instances.tolist() == ["7", ""]
     tracks = [entity for entity in last.rows if entity.startswith(entities.TRACKS)]
     assert tracks == [CAR]  # the pedestrian has no track, the bus is below the score
     assert len(last.values(entities.BEV_TRACKS, "LineStrips2D:strips")) == 2
@@ -73,13 +72,8 @@ def test_a_track_without_a_box_is_cleared(tmp_path):
     assert len(strips(frames[3], PEDESTRIAN)[2]) == 2  # it was lost for a second only: the trail goes on
 
 
-def test_boxes_of_a_recording_keep_their_identity(tmp_path):
-    frames = record_tracks(tmp_path / "r.rrd", 2, lambda place: ["7", "", "9"])
-    assert recorded_boxes(frames[1]).boxes.instances.tolist() == ["7", ""]
-
-
 def test_a_recording_without_a_tracker_has_no_tracks(tmp_path):
-    drive = MemoryDrive(1)
+    drive = MemoryDrive(1, ONE)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(drive.load(0), predict(drive.load(0)))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
@@ -112,16 +106,15 @@ def test_the_marks_of_the_tracker_count_unless_the_box_is_true():
     assert [part.tolist() for part in false_and_duplicate(boxes, None)[:2]] == [[False] * 3, [True, True, False]]
 
 
-@pytest.mark.parametrize("entity", [entities.DUPLICATES, entities.BEV_DUPLICATES])
-def test_duplicates_are_marked_in_both_views(tmp_path, entity):
-    drive = MemoryDrive(1)
+def test_duplicates_are_marked_in_both_views(tmp_path):
+    drive = MemoryDrive(1, ONE)
     frame = with_truth(drive.load(0))
     twice = boxes_ahead()[[0, 0, 1]]
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(frame, replace(predict(frame), boxes=twice))
     (read,) = RecordingReader(tmp_path / "r.rrd").frames()
-    kind = "LineStrips3D" if entity == entities.DUPLICATES else "LineStrips2D"
-    assert len(read.values(entity, f"{kind}:strips")) == 1
+    for entity, kind in ((entities.DUPLICATES, "LineStrips3D"), (entities.BEV_DUPLICATES, "LineStrips2D")):
+        assert len(read.values(entity, f"{kind}:strips")) == 1
     assert len(read.values(entities.FALSE_BOXES, "LineStrips3D:strips")) == 2  # the pedestrian
 
 

@@ -71,7 +71,6 @@ def test_a_dropped_image_starts_a_new_stream(tmp_path):
 
 def test_without_pyav_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setattr(options, "has_av", lambda: False)
-    with pytest.raises(
-        BevcliError, match=r"`images=\"av1\"` \(`--images av1`\): PyAV is not installed: pip install 'bevcli\[video\]'"
-    ):
+    said = r"`images=\"av1\"` \(`--images av1`\): PyAV is not installed: pip install 'bevcli\[video\]'"
+    with pytest.raises(BevcliError, match=said):
         options.RecordingOptions(images="av1")

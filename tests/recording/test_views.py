@@ -67,20 +67,13 @@ def test_map_classes_of_any_name_have_different_colours():
 
 def test_the_legend_names_every_class_and_map_class():
     def legend(config):
-        return [
-            text for text, _ in legend_entries(Recorded(MadeDrive(), NamedModel(config=config), RecordingOptions()))
-        ]
+        recorded = Recorded(MadeDrive(), NamedModel(config=config), RecordingOptions())
+        return [text for text, _ in legend_entries(recorded)]
 
     names = legend(replace(TINY, heads=("detection", "segmentation")))
     assert set(TINY.classes) <= {name.replace(" ", "_") for name in names}
     assert {f"map: {name.replace('_', ' ')}" for name in MAP_CLASSES} <= set(names)
     assert not any(text.startswith("map") for text in legend(TINY))
-
-
-def test_the_legend_is_in_the_recording(tmp_path):
-    record(tmp_path / "r.rrd", MemoryDrive(1))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert "traffic cone" in frame.values(f"{entities.LEGEND}/texts", "Points2D:labels")
 
 
 def test_range_rings_end_with_the_grid():
@@ -121,7 +114,7 @@ def test_titles_say_when_the_weights_do_not_know_such_images():
     assert note(NamedModel(untrained=True), rendered=True) == UNTRAINED
 
 
-def test_the_note_is_an_event_and_in_the_file(tmp_path):
+def test_note_legend_and_speed_are_in_the_recording(tmp_path):
     drive = MadeDrive()
     with Recording(tmp_path / "r.rrd", drive, Weights()) as recording:
         recording.log(drive.load(0), predict(drive.load(0)))
@@ -130,31 +123,21 @@ def test_the_note_is_an_event_and_in_the_file(tmp_path):
     chunks = [c.to_record_batch() for c in RecordingReader(tmp_path / "r.rrd").chunks() if c.entity_path == "/events"]
     texts = [text for batch in chunks for (text,) in batch.column("TextLog:text").to_pylist()]
     assert "The weights were trained on rendered streets; these images are not rendered." in texts
-
-
-def test_the_speed_is_a_curve_and_a_label(tmp_path):
-    record(tmp_path / "r.rrd", MemoryDrive(1))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert "traffic cone" in frame.values(f"{entities.LEGEND}/texts", "Points2D:labels")
     assert frame.array(entities.SPEED_CURVE, "Scalars:scalars", 1)[0, 0] == pytest.approx(6.0 * 3.6)
     assert frame.values(entities.SPEED, "Points3D:labels") == ["22 km/h"]
 
 
-def test_a_drive_without_poses_shows_no_speed(tmp_path):
-    drive = MemoryDrive(1)
-    drive.has_ego_motion = False
-    record(tmp_path / "r.rrd", drive)
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
-    assert entities.SPEED not in frame.rows
-
-
 def test_the_segmentation_lies_on_the_ground(tmp_path):
     drive = MemoryDrive(1)
+    drive.has_ego_motion = False
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, 0] = MAP_CLASSES["vehicle"]  # the first row has the largest y
     maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m)
     with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
         recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
     (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    assert entities.SPEED not in frame.rows  # without poses there is none
     texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
     assert tuple(texture[:3]) == MAP_COLORS["vehicle"]
     corners = frame.array(entities.SEGMENTATION_ON_GROUND, "Mesh3D:vertex_positions", 3)

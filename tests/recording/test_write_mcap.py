@@ -132,12 +132,9 @@ def test_an_interrupted_file_gets_no_name(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_file_is_replaced_only_with_force(file):
+def test_existing_files_and_boxes_of_another_drive_are_refused(file, tmp_path):
     with pytest.raises(OutputError, match="exists already: choose another file, or pass `force=True`"):
         open_writer(file, Truthful(), WriteOptions("mcap"))
-
-
-def test_the_boxes_of_another_drive_are_refused(file, tmp_path):
     other = MemoryDrive(3, scenes="bbb")
     options = WriteOptions("mcap", boxes=file.parent / "predictions.json")
     with pytest.raises(InputError, match="has none of the frames of memory"):

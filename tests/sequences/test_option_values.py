@@ -1,5 +1,7 @@
 """Options from Python: a value that means nothing is an error, in every dataclass of options."""
 
+from pathlib import Path
+
 import pytest
 
 from bevcli.errors import InputError
@@ -23,6 +25,8 @@ from bevcli.sequences.options import InputOptions, RigOptions
         (NativeFolder, {"times": "x" * 10**6}, "`times=x{1,60}"),
         (NativeFolder, {"image_rate_hz": 0.0}, "`image_rate_hz=0` .*images per second"),  # of the class above it
         (RecordingOptions, {"level": "most"}, "`level=most` .*expected minimal, standard, full"),
+        *((RecordingOptions, {"bev": bev}, "expected") for bev in ("channel", "channel:-1", "heat")),
+        (RecordingOptions, {"vehicle_mesh": Path("none.glb")}, r"`vehicle_mesh=none\.glb`"),
     ],
 )
 def test_a_value_that_means_nothing_is_an_error(made, values, said):
@@ -34,6 +38,7 @@ def test_a_value_that_means_nothing_is_an_error(made, values, said):
 def test_values_that_mean_something_are_taken():
     made = InputOptions(rate_hz="all", ego_motion="static", scene="a", frames=slice(0, 1))
     assert (made.rate_hz, made.ego_motion) == ("all", "static")
+    assert [RecordingOptions(bev=bev).bev for bev in ("norm", "channel:17")] == ["norm", "channel:17"]
     assert RigOptions(height={"front": 1.5}, pose_times="ns", poses_of="vehicle").pose_times == "ns"
 
 
