@@ -25,8 +25,6 @@ from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 CAR = (255, 158, 44)
 ORANGE, VIOLET = entities.LAYER_COLORS
-
-
 NAMES = ("a",), ("a", "b")
 
 
