@@ -134,23 +134,14 @@ def prepare_batch(
 
 @dataclass(frozen=True)
 class BatchSummary:
-    """Summary of a batch.
+    """Summary of a batch."""
 
-    Attributes:
-        records: of all drives that are done or have failed, in the order of the drives.
-        drives: number of drives of the batch.
-        skipped: number of drives that were done or had failed before.
-        notes: for the user.
-        stopped: before its end.
-        files: paths or URLs of the files of the batch.
-    """
-
-    records: tuple[Record, ...]
-    drives: int
-    skipped: int
-    stopped: bool
-    files: tuple[str, ...]
-    notes: tuple[str, ...] = ()
+    records: tuple[Record, ...]  # of all drives that are done or have failed, in the order of the drives
+    drives: int  # number of drives of the batch
+    skipped: int  # number of drives that were done or had failed before
+    stopped: bool  # before its end
+    files: tuple[str, ...]  # paths or URLs of the files of the batch
+    notes: tuple[str, ...] = ()  # for the user
 
     @property
     def failed(self) -> int:

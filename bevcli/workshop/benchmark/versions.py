@@ -142,19 +142,12 @@ QueryResults = tuple[Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Comparison:
-    """The fast version compared with the plain one, over all object queries of all frames.
+    """The fast version compared with the plain one, over all object queries of all frames."""
 
-    Attributes:
-        plain_frame_s: seconds of each frame of the plain version.
-        max_box_difference_m: largest distance between the two versions' box centres.
-        share_within_tenth_m: share of the box centres that are within 0.1 m of each other.
-        max_score_difference: largest difference of scores.
-    """
-
-    plain_frame_s: tuple[float, ...]
-    max_box_difference_m: float
-    share_within_tenth_m: float
-    max_score_difference: float
+    plain_frame_s: tuple[float, ...]  # seconds of each frame of the plain version
+    max_box_difference_m: float  # largest distance between the two versions' box centres
+    share_within_tenth_m: float  # share of the box centres that are within 0.1 m of each other
+    max_score_difference: float  # largest difference of scores
 
 
 class Version:

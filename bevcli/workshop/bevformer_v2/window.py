@@ -124,12 +124,9 @@ class FrameFeatures:
 
 @dataclass(frozen=True)
 class FeatureWindow:
-    """The memory of a BEVFormerV2.
+    """The memory of a BEVFormerV2."""
 
-    Attributes:
-        frames: the last frames, and with a model that looks ahead the next ones, in order of time.
-    """
-
+    # the last frames, and with a model that looks ahead the next ones, in order of time
     frames: tuple[FrameFeatures, ...]
 
     def before(self, now: FrameStamp, count: int) -> list[FrameFeatures]:

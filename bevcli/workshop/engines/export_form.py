@@ -230,19 +230,12 @@ def replace_parts(network: nn.Module, deformable_convolution: "DeformableConvolu
 
 @dataclass(frozen=True)
 class Port:
-    """An input or an output of an exported file.
+    """An input or an output of an exported file."""
 
-    Attributes:
-        name: in the file.
-        shape: of the tensor.
-        meaning: axes, units and frames, for the file's metadata.
-        dtype: of the tensor.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    meaning: str
-    dtype: torch.dtype = torch.float32
+    name: str  # in the file
+    shape: tuple[int, ...]  # of the tensor
+    meaning: str  # axes, units and frames, for the file's metadata
+    dtype: torch.dtype = torch.float32  # of the tensor
 
 
 MOST_CAMERAS = Port(

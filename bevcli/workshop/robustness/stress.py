@@ -52,17 +52,11 @@ class ConditionScores:
 
 @dataclass(frozen=True)
 class StressResults:
-    """The scores of a model under several conditions.
+    """The scores of a model under several conditions."""
 
-    Attributes:
-        header: what was tested, such as model, weights, drives, seed; for JSON.
-        scores: by condition, clean first.
-        is_complete: whether all requested conditions were run.
-    """
-
-    header: Mapping[str, Any]
-    scores: tuple[ConditionScores, ...]
-    is_complete: bool = True
+    header: Mapping[str, Any]  # what was tested, such as model, weights, drives, seed; for JSON
+    scores: tuple[ConditionScores, ...]  # by condition, clean first
+    is_complete: bool = True  # whether all requested conditions were run
 
     @property
     def clean(self) -> ConditionScores | None:

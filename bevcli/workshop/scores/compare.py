@@ -151,15 +151,10 @@ FEW_FRAMES = 10
 
 @dataclass(frozen=True)
 class Difference:
-    """One score of the models A and B.
+    """One score of the models A and B."""
 
-    Attributes:
-        values: of A and of B.
-        interval: of the difference, 95 %, lower end first; NaN of a single frame.
-    """
-
-    values: tuple[float, float]
-    interval: tuple[float, float]
+    values: tuple[float, float]  # of A and of B
+    interval: tuple[float, float]  # of the difference, 95 %, lower end first; NaN of a single frame
 
     @property
     def difference(self) -> float:
@@ -179,27 +174,16 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of `compare`.
+    """The result of `compare`."""
 
-    Attributes:
-        files: the predictions of A and of B.
-        scores: of A and of B, on the frames, classes and ranges that both have.
-        classes: AP by class.
-        mean_ap: mAP.
-        nd_score: NDS.
-        worst: the frames with most missed and most invented boxes, and those where A and B differ most.
-        resamples: number of resamples of the frames for the intervals.
-        notes: what was assumed or left out, one line each.
-    """
-
-    files: tuple[Path, Path]
-    scores: tuple[Scores, Scores]
-    classes: Mapping[str, Difference]
-    mean_ap: Difference
-    nd_score: Difference
-    worst: WorstFrames
-    resamples: int
-    notes: tuple[str, ...]
+    files: tuple[Path, Path]  # the predictions of A and of B
+    scores: tuple[Scores, Scores]  # of A and of B, on the frames, classes and ranges that both have
+    classes: Mapping[str, Difference]  # AP by class
+    mean_ap: Difference  # mAP
+    nd_score: Difference  # NDS
+    worst: WorstFrames  # the frames with most missed and most invented boxes, and those where A and B differ most
+    resamples: int  # number of resamples of the frames for the intervals
+    notes: tuple[str, ...]  # what was assumed or left out, one line each
 
     def to_dict(self) -> dict[str, Any]:
         """All of it as a dict for JSON. docs/scoring.md explains the keys."""

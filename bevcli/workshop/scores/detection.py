@@ -142,23 +142,14 @@ def _running_mean(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class ClassScores:
-    """The scores of one class.
+    """The scores of one class."""
 
-    Attributes:
-        ground_truth_count: number of ground truths.
-        prediction_count: number of predictions.
-        recall: share of ground truth that is found at the error distance, 0 to 1; NaN without ground truth.
-        aps: by matching distance in metres, average precision, 0 to 1.
-        errors: by the devkit's names, mean true-positive errors; NaN where undefined.
-        curves: by matching distance in metres.
-    """
-
-    ground_truth_count: int
-    prediction_count: int
-    recall: float
-    aps: Mapping[float, float]
-    errors: Mapping[str, float]
-    curves: Mapping[float, RecallCurve] = field(repr=False)
+    ground_truth_count: int  # number of ground truths
+    prediction_count: int  # number of predictions
+    recall: float  # share of ground truth that is found at the error distance, 0 to 1; NaN without ground truth
+    aps: Mapping[float, float]  # by matching distance in metres, average precision, 0 to 1
+    errors: Mapping[str, float]  # by the devkit's names, mean true-positive errors; NaN where undefined
+    curves: Mapping[float, RecallCurve] = field(repr=False)  # by matching distance in metres
 
     @property
     def mean_ap(self) -> float:
@@ -168,15 +159,10 @@ class ClassScores:
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """The scores of several classes and their means; the means are NaN without any class.
+    """The scores of several classes and their means; the means are NaN without any class."""
 
-    Attributes:
-        classes: by name.
-        mean_ap_weight: weight of mAP in NDS.
-    """
-
-    classes: Mapping[str, ClassScores]
-    mean_ap_weight: float
+    classes: Mapping[str, ClassScores]  # by name
+    mean_ap_weight: float  # weight of mAP in NDS
 
     @property
     def ground_truth_count(self) -> int:
@@ -228,19 +214,12 @@ def known_mean(values: Iterable[float]) -> float:
 
 @dataclass(frozen=True)
 class DetectionScores:
-    """The scores of the boxes of some frames. Each table is computed when it is first asked for.
+    """The scores of the boxes of some frames. Each table is computed when it is first asked for."""
 
-    Attributes:
-        frame_count: number of frames.
-        matches: by class, the matching.
-        unmeasured: names of errors that are left out, because no ground truth has the quantity.
-        config: parameters of the matching and of the score.
-    """
-
-    frame_count: int
-    matches: tuple[ClassMatches, ...] = field(repr=False)
-    unmeasured: tuple[str, ...]
-    config: DetectionConfig
+    frame_count: int  # number of frames
+    matches: tuple[ClassMatches, ...] = field(repr=False)  # by class, the matching
+    unmeasured: tuple[str, ...]  # names of errors that are left out, because no ground truth has the quantity
+    config: DetectionConfig  # parameters of the matching and of the score
 
     @cached_property
     def overall(self) -> ScoreTable:

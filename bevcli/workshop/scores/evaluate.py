@@ -37,17 +37,12 @@ _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 
 @dataclass(frozen=True)
 class SegmentationScores:
-    """The scores of maps: IoU in cells, each summed over all frames.
+    """The scores of maps: IoU in cells, each summed over all frames."""
 
-    Attributes:
-        intersection: by class, cells that have the class in prediction and ground truth, over all maps.
-        union: by class, cells that have it in prediction or ground truth, over all maps.
-        frame_count: number of pairs of maps.
-    """
-
+    # by class, cells that have the class in prediction and ground truth, over all maps
     intersection: Mapping[str, float]
-    union: Mapping[str, float]
-    frame_count: int
+    union: Mapping[str, float]  # by class, cells that have it in prediction or ground truth, over all maps
+    frame_count: int  # number of pairs of maps
 
     @property
     def iou(self) -> dict[str, float]:
@@ -57,23 +52,15 @@ class SegmentationScores:
 
 @dataclass(frozen=True)
 class FrameScores:
-    """The scores of the boxes, maps and further results of some frames.
+    """The scores of the boxes, maps and further results of some frames."""
 
-    Attributes:
-        detection: the scores of the boxes.
-        segmentation: the scores of the maps; None where predictions or ground truth have none.
-        tracking: the scores of tracks.
-        vad: those of lines of the map, forecasts and planned paths.
-        worst: the frames with most missed and most invented boxes.
-        notes: what was assumed or left out, one line each.
-    """
-
-    detection: DetectionScores
+    detection: DetectionScores  # the scores of the boxes
+    # the scores of the maps; None where predictions or ground truth have none
     segmentation: SegmentationScores | None = None
-    tracking: TrackingScores | None = None
-    vad: DrivingScores | None = None
-    worst: WorstFrames | None = None
-    notes: tuple[str, ...] = ()
+    tracking: TrackingScores | None = None  # the scores of tracks
+    vad: DrivingScores | None = None  # those of lines of the map, forecasts and planned paths
+    worst: WorstFrames | None = None  # the frames with most missed and most invented boxes
+    notes: tuple[str, ...] = ()  # what was assumed or left out, one line each
 
     @property
     def others(self) -> list[TrackingScores | DrivingScores | WorstFrames]:
@@ -106,13 +93,9 @@ class FrameScores:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores(FrameScores):
-    """The result of `evaluate`.
+    """The result of `evaluate`."""
 
-    Attributes:
-        pairs: the frames that were scored.
-    """
-
-    pairs: inputs.FramePairs
+    pairs: inputs.FramePairs  # the frames that were scored
 
     def table(self) -> str:
         frames = f"{counted(self.detection.frame_count, 'frames')}, matched by {self.pairs.matched_by}"

@@ -188,21 +188,13 @@ SUMMED = ("mt", "ml", "tp", "fp", "fn", "ids", "frag")
 
 @dataclass(frozen=True)
 class TrackingScores:
-    """The tracking metrics of all classes.
+    """The tracking metrics of all classes."""
 
-    Attributes:
-        classes: class -> its metrics.
-        config: the parameters that they were computed with.
-        scenes: number of scenes.
-        frames: number of frames.
-        notes: differences from nuScenes, one line each.
-    """
-
-    classes: Mapping[str, ClassTracking]
-    config: TrackingConfig
-    scenes: int
-    frames: int
-    notes: tuple[str, ...] = ()
+    classes: Mapping[str, ClassTracking]  # class -> its metrics
+    config: TrackingConfig  # the parameters that they were computed with
+    scenes: int  # number of scenes
+    frames: int  # number of frames
+    notes: tuple[str, ...] = ()  # differences from nuScenes, one line each
 
     @property
     def overall(self) -> dict[str, float]:

@@ -40,26 +40,16 @@ def best_outcome(matches: ClassMatches, row: int) -> Outcome:
 
 @dataclass(frozen=True)
 class WorstFrames:
-    """The worst of F frames, for M models, which are one or two.
+    """The worst of F frames, for M models, which are one or two."""
 
-    Attributes:
-        frames: of the ground truth.
-        boxes: (F,), number of ground truths that are scored.
-        missed: (M, F), number of ground truths that a model does not find.
-        invented: (M, F), number of its false positives.
-        count: the largest number of frames in a list.
-        distance_m: the matching distance.
-        command: the words of `bevcli viz` with the boxes; empty if the ground truth is not a drive.
-        scene_starts: index of the first frame by scene, if `bevcli viz` should open a scene whose frames count from 0.
-    """
-
-    frames: tuple[FrameBoxes, ...]
-    boxes: NDArray[np.int64]
-    missed: NDArray[np.int64]
-    invented: NDArray[np.int64]
-    count: int
-    distance_m: float
-    command: tuple[str, ...] = ()
+    frames: tuple[FrameBoxes, ...]  # of the ground truth
+    boxes: NDArray[np.int64]  # (F,), number of ground truths that are scored
+    missed: NDArray[np.int64]  # (M, F), number of ground truths that a model does not find
+    invented: NDArray[np.int64]  # (M, F), number of its false positives
+    count: int  # the largest number of frames in a list
+    distance_m: float  # the matching distance
+    command: tuple[str, ...] = ()  # the words of `bevcli viz` with the boxes; empty if the ground truth is not a drive
+    # index of the first frame by scene, if `bevcli viz` should open a scene whose frames count from 0
     scene_starts: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

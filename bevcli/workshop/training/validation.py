@@ -142,30 +142,19 @@ def _no_known_class(described: str, named: str, example: str, config: ModelConfi
 
 @dataclass(frozen=True)
 class DriveScores:
-    """The detection scores of one drive alone, over the classes that it has.
+    """The detection scores of one drive alone, over the classes that it has."""
 
-    Attributes:
-        name: of the drive.
-        cameras: the number of its cameras.
-        mean_ap: mAP, 0 to 1; NaN without ground truth.
-        nd_score: NDS, 0 to 1; NaN without ground truth.
-    """
-
-    name: str
-    cameras: int
-    mean_ap: float
-    nd_score: float
+    name: str  # of the drive
+    cameras: int  # the number of its cameras
+    mean_ap: float  # mAP, 0 to 1; NaN without ground truth
+    nd_score: float  # NDS, 0 to 1; NaN without ground truth
 
 
 @dataclass(frozen=True)
 class Validation(FrameScores):
-    """Scores over all frames of several drives.
+    """Scores over all frames of several drives."""
 
-    Attributes:
-        drives: the scores of each drive alone; empty if they were not asked for.
-    """
-
-    drives: tuple[DriveScores, ...] = ()
+    drives: tuple[DriveScores, ...] = ()  # the scores of each drive alone; empty if they were not asked for
 
     def summary(self) -> dict[str, float]:
         """mAP, NDS and mAVE (m/s) over the classes that have ground truth, NaN without any; IoU by class, of a map."""

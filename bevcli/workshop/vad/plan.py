@@ -59,25 +59,19 @@ class PlanWriter(GrowingFile):
 
 @dataclass(frozen=True)
 class Plan(FrameResult):
-    """Planned paths of the vehicle, one for each command of the driver.
-
-    Attributes:
-        commands: names of the C commands.
-        paths: (C, T, 2) x and y in the bev frame, or (C, T, 3) points on the ground in the ego or world frame, metres:
-            future places of the origin of the bev frame.
-        times_s: (T,) seconds from the frame's time.
-        command: the one that was given, "" for none.
-    """
+    """Planned paths of the vehicle, one for each command of the driver."""
 
     kind = "plan"
     file_name = "plan.csv"
     writer = PlanWriter
     takes_command = True
 
-    commands: tuple[str, ...]
+    commands: tuple[str, ...]  # names of the C commands
+    # (C, T, 2) x and y in the bev frame, or (C, T, 3) points on the ground in the ego or world frame, metres: future
+    # places of the origin of the bev frame
     paths: Array
-    times_s: Array
-    command: str = ""
+    times_s: Array  # (T,) seconds from the frame's time
+    command: str = ""  # the one that was given, "" for none
 
     @classmethod
     def legend(cls, names: tuple[str, ...]) -> dict[str, Color]:
