@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.scores.evaluate import evaluate as evaluate
     from bevcli.workshop.scores.record import record as record
     from bevcli.workshop.synth.drive import render as render
-    from bevcli.workshop.training.train import train as train, validate as validate
+    from bevcli.workshop.training.trainer import train as train, validate as validate
     from bevcli.workshop.trust.estimate import estimate_score as estimate_score
     from bevcli.workshop.video import video as video
     from bevcli.workshop.weights.hub import pack_model as pack_model

@@ -23,10 +23,8 @@ from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.viewer import recording_file
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
-from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
-from bevcli.workshop.vad.vad import VAD, VADConfig
+from bevcli.workshop.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
+from bevcli.workshop.vad.vad import VAD, LineDecoderConfig, MotionConfig, VADConfig
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,8 +8,7 @@ import torch
 
 from bevcli.config import load_config
 from bevcli.model.bevformer.bevformer import BEVFormer
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
+from bevcli.workshop.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/bevformer.md"

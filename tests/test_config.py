@@ -16,7 +16,7 @@ from bevcli.config import TRAINING, as_table, config_of_table, known_models, loa
 from bevcli.errors import BevcliError, ConfigError, WeightsError
 from bevcli.published import named_weights
 from bevcli.registry import OWN, Group
-from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
+from bevcli.workshop.bevformer_v2 import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
 
 

@@ -21,7 +21,7 @@ from bevcli.model.temporal_model import build_model
 from bevcli.registry import entries
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
+from bevcli.workshop.bevformer_v2 import BEVFormerV2
 from bevcli.workshop.engines.export_onnx import calibration_images, export_onnx, quantize
 from bevcli.workshop.engines.exported import FrameDifference, check_exported
 

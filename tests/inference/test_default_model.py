@@ -69,7 +69,7 @@ def test_a_run_chooses_it_by_its_drive(real, tmp_path):
 
 @pytest.mark.parametrize("data", [{"data": STREET}, {"rendered": (1_000_000,)}])
 def test_a_validation_of_rendered_drives_takes_demo(data, monkeypatch):
-    monkeypatch.setattr("bevcli.workshop.training.train.load_model", stop)
+    monkeypatch.setattr("bevcli.workshop.training.trainer.load_model", stop)
     with pytest.raises(InputError, match=r"^demo$"):
         bevcli.validate(**data)
 

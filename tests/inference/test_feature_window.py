@@ -12,7 +12,7 @@ from stepping import CPU, run
 from bevcli.geometry.transforms import Pose, inverse
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
-from bevcli.workshop.bevformer_v2.window import fill_window, other_bev_from_bev
+from bevcli.workshop.bevformer_v2 import fill_window, other_bev_from_bev
 
 
 def assert_same(one, other):

@@ -25,7 +25,7 @@ from bevcli.model.step import PreparedFrame
 from bevcli.runs.run_into_folder import run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.workshop.benchmark.versions import made_up_model
-from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config
+from bevcli.workshop.bevformer_v2 import BEVFormerV2Config
 from bevcli.workshop.uniad.uniad import UniADConfig
 
 CPU = torch.device("cpu")

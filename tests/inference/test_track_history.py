@@ -22,8 +22,7 @@ from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.workshop.training import validation
 from bevcli.workshop.uniad.map_head import MapHeadConfig
-from bevcli.workshop.uniad.track_queries import TrackQueryConfig
-from bevcli.workshop.uniad.uniad import UniAD, UniADConfig
+from bevcli.workshop.uniad.uniad import TrackQueryConfig, UniAD, UniADConfig
 
 MAP_HEAD = MapHeadConfig(
     thing_queries=12, max_things=6, encoder_layers=1, location_layers=2, thing_mask_layers=1, stuff_mask_layers=1,
@@ -249,5 +248,5 @@ def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
 
     scored: list[list[str]] = []
     monkeypatch.setattr(validation, "score_tracks", keep)
-    validation.validate(Runner(model, CPU, tracker=TrackerConfig()), OneDrive([Labelled(whole[:3])]))
+    validation.score_drives(Runner(model, CPU, tracker=TrackerConfig()), OneDrive([Labelled(whole[:3])]))
     assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]

@@ -27,8 +27,7 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.step import ModelInputs
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.workshop.bevformer_v2.window import BEVFormerV2Config, WindowFrame, other_bev_from_bev
+from bevcli.workshop.bevformer_v2 import BEVFormerV2, BEVFormerV2Config, WindowFrame, other_bev_from_bev
 
 DATA = Path(__file__).parents[1] / "data"
 STEM_GAIN = {"tiny": 1.0}

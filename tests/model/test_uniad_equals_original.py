@@ -22,7 +22,7 @@ from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z, 
 from bevcli.model.decoder import ObjectQueries
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.workshop.uniad.map_head import merge_map
-from bevcli.workshop.uniad.track_queries import (
+from bevcli.workshop.uniad.uniad import (
     EGO,
     NO_TRACK,
     FrameMotion,
@@ -31,11 +31,13 @@ from bevcli.workshop.uniad.track_queries import (
     QueryInteraction,
     TrackQueries,
     TrackQueryConfig,
+    UniAD,
+    UniADOutputs,
+    decode_tracks,
     expected_centers,
     live_and_die,
     with_tracks,
 )
-from bevcli.workshop.uniad.uniad import UniAD, UniADOutputs, decode_tracks
 
 KEPT = np.load(original.DATA / "golden_uniad_tracks.npz")
 

@@ -18,7 +18,7 @@ import torch
 from bevcli.config import load_config
 from bevcli.model.pillar_projection import Pillars
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
+from bevcli.workshop.bevformer_v2 import BEVFormerV2
 
 KEPT = np.load(original.DATA / "golden_v2.npz")
 SHARED = os.environ.get("BEVCLI_SHARED", "")

@@ -23,8 +23,7 @@ from bevcli.config import load_config
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs
-from bevcli.workshop.vad.heads import line_positions
-from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, decode_plan
+from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, decode_plan, line_positions
 
 KEPT = np.load(original.DATA / "golden_vad.npz")
 SCENE_STARTS = (0, 3)

@@ -15,8 +15,7 @@ from bevcli.geometry.transforms import Pose, inverse, rigid
 from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.temporal_model import TemporalModel
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.workshop.bevformer_v2.window import FeatureWindow, FrameFeatures
+from bevcli.workshop.bevformer_v2 import BEVFormerV2, FeatureWindow, FrameFeatures
 from bevcli.workshop.odometry import measure
 from bevcli.workshop.odometry.measure import MeasuredStep
 

@@ -25,7 +25,7 @@ from bevcli.workshop.robustness.stress import (
     stress,
     stress_table,
 )
-from bevcli.workshop.training.validation import drives_table, validate
+from bevcli.workshop.training.validation import drives_table, score_drives
 
 FRAMES = 3
 TRIED = ("clean", "frame_lost", "snow", "calibration_noise", "ego_motion_lost", "frame_rate")
@@ -87,10 +87,10 @@ def test_every_condition_is_scored_and_changes_the_predictions(whole):
 
 
 def test_the_clean_scores_are_those_of_validate(whole, model, drives):
-    together = validate(Runner(model.prepared, model.device), DrivesInMemory(drives), each_drive=True)
+    together = score_drives(Runner(model.prepared, model.device), DrivesInMemory(drives), each_drive=True)
     summary = together.summary()
     assert content(whole)["conditions"][0]["nd_score"] == pytest.approx(summary["NDS"], abs=1e-9)
-    second = validate(Runner(model.prepared, model.device), DrivesInMemory(drives[1:])).summary()
+    second = score_drives(Runner(model.prepared, model.device), DrivesInMemory(drives[1:])).summary()
     assert [(drive.name, drive.cameras) for drive in together.drives] == [("memory", 6), ("second", 6)]
     assert (together.drives[1].mean_ap, together.drives[1].nd_score) == (second["mAP"], second["NDS"])
     assert drives_table(together.drives).splitlines()[-1].startswith("mAP: mean 0.")

@@ -34,9 +34,8 @@ from bevcli.sequences.files.incremental_json import GrowingFile
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines, read_lines
 from bevcli.workshop.live import Session
-from bevcli.workshop.vad.heads import LineDecoderConfig, MotionConfig
 from bevcli.workshop.vad.plan import Plan, read_plans
-from bevcli.workshop.vad.vad import VAD, VADConfig
+from bevcli.workshop.vad.vad import VAD, LineDecoderConfig, MotionConfig, VADConfig
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 FRAMES = 3

@@ -30,7 +30,7 @@ from bevcli.runs.state import FORMAT, RunState, load_state, save_state
 from bevcli.runs.summary import Counts, RunningMedian
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.bevformer_v2.window import FeatureWindow
+from bevcli.workshop.bevformer_v2 import FeatureWindow
 from bevcli.workshop.uniad.uniad import TrackMemory
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from bevcli.workshop.synth.photo_kernels import TEXTURE_MEAN, TEXTURE_SIZE
+from bevcli.workshop.synth.shading_kernels import TEXTURE_MEAN, TEXTURE_SIZE
 
 Array = NDArray[np.float32]
 

@@ -25,7 +25,7 @@ from bevcli.printing import say
 from bevcli.sequences.open import DriveView, open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.odometry.measure import MeasuredMotion, measure_motion
-from bevcli.workshop.training.validation import validate
+from bevcli.workshop.training.validation import score_drives
 
 SHORTEST_WAY_M = 5.0  # of a drive whose end is stated in per cent
 SHORTEST_STEP_M = 0.5  # of a step whose length is stated in per cent
@@ -198,7 +198,7 @@ def scores(paths: list[Path], motions: list[MeasuredMotion], model: str) -> Iter
     found = []
     for name, drives in (("right", right), ("measured", measured_drives)):
         opened = OpenDrives(list(drives))
-        found.append(validate(runner, opened, each_drive=True))
+        found.append(score_drives(runner, opened, each_drive=True))
         yield f"{name} motion: {found[-1]}"
         yield "  " + ", ".join(f"{each.name} {each.nd_score:.3f}" for each in found[-1].drives)
     ratio = found[1].summary()["NDS"] / found[0].summary()["NDS"]

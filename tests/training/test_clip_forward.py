@@ -13,8 +13,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.resnet import ResNet, ResNetConfig
 from bevcli.model.temporal_model import build_model
-from bevcli.workshop.bevformer_v2.bevformer_v2 import BEVFormerV2
-from bevcli.workshop.bevformer_v2.window import NO_EGO_MOTION, BEVFormerV2Config, BevFusionConfig
+from bevcli.workshop.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip

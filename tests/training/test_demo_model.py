@@ -15,7 +15,7 @@ from bevcli.inference.runner import Runner
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.sequences.open import select_range
 from bevcli.workshop.synth.drives import FolderDrives
-from bevcli.workshop.training.validation import validate
+from bevcli.workshop.training.validation import score_drives
 
 STREET = Path(__file__).parents[2] / "samples" / "street"
 
@@ -66,7 +66,7 @@ def test_it_finds_cars_and_road_in_the_sample_street() -> None:
     """Thresholds far below the model card's scores, but far above those of random weights."""
     model = load_model("demo", device="cpu")
     drives = FourFrames([STREET], model.config)
-    scores = validate(Runner(model.prepared, model.device, tracker=model.tracker), drives)
+    scores = score_drives(Runner(model.prepared, model.device, tracker=model.tracker), drives)
     assert scores.detection.overall.classes["car"].mean_ap > 0.2
     assert scores.segmentation.iou["drivable_road"] > 0.6
     cars = scores.tracking.classes["car"].metrics

@@ -3,7 +3,7 @@
 evaluate            the entry point: reads predictions and ground truth, scores them; dict for JSON, and tables
 inputs              predictions and ground truth from files, folders or a nuScenes root, and pairs of their frames
 detection           boxes of many frames -> AP, mAP, true-positive errors, NDS; reads no files
-tracking            boxes with identities -> AMOTA and what comes with it; `association` matches them
+tracking            boxes with identities -> the track of each object -> AMOTA and what comes with it
 compare             two models on the same frames, with intervals from frames that are drawn again
 worst_frames        the frames with most missed and most invented boxes
 tables              a table of scores as text, CSV and LaTeX

@@ -2,7 +2,7 @@
 
 meshes     `mesh` (primitives), `road_users`, `catalog` (what stands still; all annotated objects by class)
 world      `city` (streets, blocks, routes), `scenery` and its looks, `ground`, `traffic`, `simulation` (all actors)
-images     `rig` (cameras and lenses), `shading_kernels`, `photo_kernels`, `material` (a user's photographs), `renderer`
+images     `rig` (cameras and lenses), `shading_kernels`, `material` (a user's photographs), `renderer`
 drives     `drive` (one drive; `render`), `drives` (of a training, a validation, a stress test)
 
 Each module imports only from those before it.

@@ -25,10 +25,9 @@ from bevcli.parsing.files import read_bytes
 from bevcli.parsing.images import decode_image
 from bevcli.workshop.synth.catalog import COLORS, Variant
 from bevcli.workshop.synth.mesh import Material, Mesh, TriangleSoup, linear
-from bevcli.workshop.synth.photo_kernels import TEXTURE_SIZE, retouch_pixels
 from bevcli.workshop.synth.rig import material_files
 from bevcli.workshop.synth.scenery import Looks, Weather
-from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT
+from bevcli.workshop.synth.shading_kernels import LIGHT_LIMIT, TEXTURE_SIZE, retouch_pixels
 
 TEXTURE_KINDS = ("wall", "facade", "asphalt", "pavement", "leaf")
 MOST_PIXELS, MOST_BYTES = 2**25, 2**28

@@ -8,7 +8,7 @@ In the order of a training step:
     clip_steps             forward passes through clips: of the model, of its frozen stages, of a teacher
     losses                 Hungarian matching, focal, L1 and dice loss of boxes, masks and BEV cells
     frame_losses           all losses of a frame by name, among them BEVFormerV2's detector on the image features
-    trainer                the loop: updates of the weights, checkpoints, released weights
+    trainer                the loop: updates of the weights, checkpoints, released weights; `train` and `validate`
     job                    the [training] table of a model file, and the model, drives and processes of a training
     warm_start             weights of another model, or of a backbone for ImageNet, to start from
     model_file             a new model file for a data set

@@ -50,7 +50,7 @@ def train(
 
     `torchrun --nproc-per-node N -m bevcli train …` trains with N processes, one for each GPU or CPU core.
     """
-    from bevcli.workshop.training import model_file, train as work
+    from bevcli.workshop.training import model_file, trainer as work
 
     if file_options.init is not None:
         if model or options != TrainOptions():
@@ -118,7 +118,7 @@ def validate(
     `bevcli train` never uses rendered drives with seeds of 1000000 and above: keep them for this.
     Where no drive has ground truth, the boxes are compared with what a detector sees in the images.
     """
-    from bevcli.workshop.training import train as work, validation
+    from bevcli.workshop.training import trainer as work, validation
 
     chosen, why = work.choose_model(replace(model_options, model=model), work.paths_to_score(drive_options))
     loaded = bevcli.load_model(options=chosen)
@@ -138,7 +138,7 @@ def validate(
     with Progress(total, "frames", notes) as progress:
         runner = loaded.runner(StepOptions(track=options.tracking, temporal=run_options.temporal))
         frames = progress.each(validation.run_drives(runner, drives))
-        scores = validation.score_frames(frames, runner, drives, options.max_range, each_drive=options.each)
+        scores = validation.score_drives(runner, drives, options.max_range, each_drive=options.each, frames=frames)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
 
 

@@ -196,27 +196,20 @@ def run_drives(runner: Runner, drives: Drives) -> Iterator[ScoredFrame]:
             logging.getLogger("bevcli").warning("warning: %s", one_line(words))
 
 
-def validate(
-    runner: Runner, drives: Drives, max_range_m: float | None = None, *, each_drive: bool = False
-) -> Validation:
-    """Run every frame of the drives and score them: see `score_frames`."""
-    return score_frames(run_drives(runner, drives), runner, drives, max_range_m, each_drive=each_drive)
-
-
-def score_frames(
-    frames: Iterable[ScoredFrame],
+def score_drives(
     runner: Runner,
     drives: Drives,
     max_range_m: float | None = None,
     *,
     each_drive: bool = False,
+    frames: Iterable[ScoredFrame] | None = None,
 ) -> Validation:
     """The scores over the frames that have ground truth. Tracks are scored where the runner has a tracker.
 
     Args:
-        frames: of `run_drives`; none is kept.
         max_range_m: ignore boxes beyond this distance, metres; by default beyond the nearest side of the BEV grid.
         each_drive: score each drive alone too.
+        frames: of `run_drives`, the default; none is kept.
     """
     range_m = runner.config.bev_grid.nearest_side_m if max_range_m is None else max_range_m
     classes = runner.config.object_classes
@@ -225,7 +218,7 @@ def score_frames(
     boxes: list[list[tuple[Boxes3D, Boxes3D]]] = [[] for _ in range(len(drives))]
     maps = []
     tracks: list[tuple[FrameBoxes, FrameBoxes]] = []
-    for index, frame, prediction in frames:
+    for index, frame, prediction in run_drives(runner, drives) if frames is None else frames:
         if frame.ground_truth is not None:
             if tracked:
                 # Scenes of different drives may share a name.

@@ -1,1 +1,0 @@
-"""BEVFormerV2 (Yang et al. 2022)."""
