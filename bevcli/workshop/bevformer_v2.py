@@ -50,9 +50,7 @@ class BevFusionConfig:
     """The fusion of the window's BEV maps."""
 
     blocks: int = 3  # number of residual blocks
-    # channels of the blocks. Where the concatenated maps have another number of channels, the first block's shortcut is
-    # a convolution
-    width: int = 512
+    width: int = 512  # channels of the blocks; the first one has a convolution as shortcut where it gets others
 
     def __post_init__(self) -> None:
         if min(self.blocks, self.width) < 1:
@@ -70,10 +68,8 @@ class BEVFormerV2Config(ModelConfig):
     # the frames of the window, relative to the current one, in the order of fusion: [-1, 0] is the previous frame and
     # the current one. Positive numbers are later frames (offline use)
     frames: tuple[int, ...]
-    # fuses the BEV maps of the window; unused where the window has only one frame
-    fusion: BevFusionConfig = field(default_factory=BevFusionConfig)
-    # switched off; the poses enter by the projections of the window's frames
-    ego_motion: EgoMotionConfig = NO_EGO_MOTION
+    fusion: BevFusionConfig = field(default_factory=BevFusionConfig)  # of the BEV maps of a window of several frames
+    ego_motion: EgoMotionConfig = NO_EGO_MOTION  # poses enter by the projections of the window's frames
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -148,8 +144,7 @@ class FrameFeatures:
 class FeatureWindow:
     """The memory of a BEVFormerV2."""
 
-    # the last frames, and with a model that looks ahead the next ones, in order of time
-    frames: tuple[FrameFeatures, ...]
+    frames: tuple[FrameFeatures, ...]  # the last ones, and with a model that looks ahead the next, by time
 
     def before(self, now: FrameStamp, count: int) -> list[FrameFeatures]:
         """The last `count` frames before the current one."""

@@ -366,15 +366,10 @@ def write_video(recording: Path, video: Path, count: int, rate: float, view: Vid
             for index, image in enumerate(chain([first], images)):
                 write(image)
                 yield index
-        _check_complete(unfinished, count)
-
-
-def _check_complete(video: str, count: int) -> None:
-    """Raises OSError where a video lacks frames: OpenCV does not tell that a disk is full."""
-    capture = cv2.VideoCapture(video)
-    frames = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else -1  # computed from the times in a WebM
-    if frames < max(count - 1, 0):
-        raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
+        capture = cv2.VideoCapture(unfinished)
+        frames = capture.get(cv2.CAP_PROP_FRAME_COUNT) if capture.isOpened() else -1  # of a WebM, from the times
+        if frames < max(count - 1, 0):  # OpenCV does not tell that a disk is full
+            raise OSError(errno.ENOSPC, "not all frames are in the file: is the disk full?")
 
 
 @contextmanager

@@ -283,7 +283,8 @@ def test_the_newest_memory_is_last_and_the_oldest_is_dropped(bank: MemoryBank) -
 def test_a_track_without_memories_keeps_its_embedding(bank: MemoryBank) -> None:
     embedding = torch.randn(2, 8)
     _, after = bank(embedding, Memories.empty(embedding, length=4))
-    memories = Memories.empty(embedding[:1], length=4).followed_by(after[1:])
+    columns = zip(*(vars(part).values() for part in (Memories.empty(embedding[:1], length=4), after[1:])), strict=True)
+    memories = Memories(*map(torch.cat, columns))
     attended, _ = bank(embedding, memories)
     assert torch.equal(attended[0], embedding[0])
     assert not torch.allclose(attended[1], embedding[1])

@@ -23,7 +23,7 @@ from bevcli.config import load_config
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs
-from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, decode_plan, line_positions
+from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, line_positions
 
 KEPT = np.load(original.DATA / "golden_vad.npz")
 SCENE_STARTS = (0, 3)
@@ -74,7 +74,7 @@ def check_results(outputs: VADOutputs, expected: Arrays) -> None:
     futures = boxes.futures[..., 1:] - boxes.centers[:, None, None, :2]
     close(futures, expected["trajs_3d"].cumsum(2), 1e-2)
     check_lines(outputs, expected)
-    plan = decode_plan(outputs, config)
+    *_, plan = model().decode(outputs)
     assert plan.commands == ("right", "left", "straight")
     close(plan.paths, expected["ego_traj"], 1e-2)
     np.testing.assert_allclose(plan.times_s, [0.5, 1, 1.5, 2, 2.5, 3])

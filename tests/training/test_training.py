@@ -32,7 +32,6 @@ from bevcli.workshop.training.trainer import (
     load_checkpoint,
     make_optimizer,
     save_checkpoint,
-    set_learning_rate,
 )
 from bevcli.workshop.training.validation import LearningCurve, draw_learning_curves
 
@@ -344,8 +343,7 @@ def test_the_learning_rate_warms_up_and_decays_by_a_cosine() -> None:
     assert config.learning_rate_at(10, 100) == max(config.learning_rate_at(step, 100) for step in range(100))
     model = BEVFormer(CONFIG)
     optimizer = make_optimizer(model, model.backbone, replace(config, backbone_share=0.1))
-    set_learning_rate(optimizer, 0.3)
-    assert [group["lr"] for group in optimizer.param_groups] == pytest.approx([0.3, 0.03])
+    assert [group["share"] for group in optimizer.param_groups] == [1.0, 0.1]
 
 
 def test_the_training_table_is_read_apart_from_the_model_config(tmp_path: Path) -> None:

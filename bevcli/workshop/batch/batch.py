@@ -71,30 +71,32 @@ def batch(
     texts = [drives] if isinstance(drives, str | Path) else list(drives)
     if "recording" not in options:
         run_options = replace(run_options, recording=recording)
-    batch_drives, notes = drives_of(list(map(str, texts)), batch_options, format_values)
-    model, more = choose_model(model, [drive.source for drive in batch_drives])
-    job = job_of(batch_options, workers, model, run_options)
+    job, found, notes = job_of(list(map(str, texts)), batch_options, workers, model, run_options, format_values)
     loaded = load_model(options=options_to_load(job, workers, fetch=model.fetch))
-    prepared = prepare_batch(
-        job, loaded, batch_drives, (*more, *notes), batch_options, workers, input_options, format_values
-    )
+    prepared = prepare_batch(job, loaded, found, notes, batch_options, workers, input_options, format_values)
     for _ in prepared.run():
         pass
     return prepared.summary
 
 
-def drives_of(
-    texts: Sequence[str], options: BatchOptions, format_values: Mapping[str, Any]
-) -> tuple[list[BatchDrive], tuple[str, ...]]:
-    """The drives of arguments and of the list in the options, and notes, as `find_drives`. Raises InputError."""
+def job_of(
+    texts: Sequence[str],
+    options: BatchOptions,
+    workers: Workers,
+    model: ModelOptions,
+    run_options: RunOptions,
+    format_values: Mapping[str, Any],
+) -> tuple[Job, list[BatchDrive], tuple[str, ...]]:
+    """The job of a batch, as far as it does not depend on the loaded model, its drives, and notes. Raises InputError.
+
+    texts: drives, besides those of the list in the options.
+    """
     texts = [*texts, *(read_list(options.listed) if options.listed else ())]
-    return find_drives(texts, NuScenesOptions(format_values.get("version"), format_values.get("split")))
-
-
-def job_of(options: BatchOptions, workers: Workers, model: ModelOptions, run_options: RunOptions) -> Job:
-    """The job of a batch, as far as it does not depend on the model."""
+    drives, notes = find_drives(texts, NuScenesOptions(format_values.get("version"), format_values.get("split")))
+    model, why = choose_model(model, [drive.source for drive in drives])
     out = options.out if storage.is_url(options.out) else str(Path(options.out.removeprefix("file://")).absolute())
-    return Job(out, with_absolute_paths(model), run=run_options, evaluate=options.evaluate, retries=workers.retries)
+    job = Job(out, with_absolute_paths(model), run=run_options, evaluate=options.evaluate, retries=workers.retries)
+    return job, drives, (*why, *notes)
 
 
 def options_to_load(job: Job, workers: Workers, *, fetch: bool = False) -> ModelOptions:

@@ -62,11 +62,10 @@ def batch(
 
     if options.retry_failed and not options.resume:
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
-    found, notes = work.drives_of(drives or [], options, format_options)
-    model, more = work.choose_model(model, [drive.source for drive in found])
-    job = work.job_of(options, workers, model, replace(run_options, recording=recording))
+    run_options = replace(run_options, recording=recording)
+    job, found, notes = work.job_of(drives or [], options, workers, model, run_options, format_options)
     loaded = load_with_bar(work.options_to_load(job, workers, fetch=model.fetch))
-    summary = _run(work.prepare_batch(job, loaded, found, (*more, *notes), options, workers, source, format_options))
+    summary = _run(work.prepare_batch(job, loaded, found, notes, options, workers, source, format_options))
     say(summary.table())
     if summary.failed:
         say("some drives failed; `--resume --retry-failed` runs them again", err=True)

@@ -48,8 +48,7 @@ class BatchDrive:
     source: str  # path or URL of its folder or file, or of the nuScenes root that contains it
     name: str  # short name, for the folder of its results
     scene: str | None = None  # of a nuScenes root, None for other inputs
-    # hash of the name and of names, sizes and versions of the files; "" if they could not be listed
-    input_hash: str = ""
+    input_hash: str = ""  # of the name and of names, sizes and versions of the files; "" if they could not be listed
     problem: str = ""  # why it cannot be run, "" if nothing is known
 
     def result(self, job_hash: str) -> str:
@@ -195,8 +194,7 @@ class Job:
 
     out: str  # path or URL of the batch's folder
     model: ModelOptions = field(default_factory=ModelOptions)  # options of `load_model`
-    # options of `open_sequence`; the scene is that of the drive
-    source: InputOptions = field(default_factory=InputOptions)
+    source: InputOptions = field(default_factory=InputOptions)  # of `open_sequence`; the scene is that of the drive
     own: tuple[Format, ...] = ()  # options of formats; a format that is missing has its defaults
     run: RunOptions = field(default_factory=RunOptions)  # options of `run_into_folder`
     evaluate: bool = False  # whether drives with ground truth are scored

@@ -160,7 +160,14 @@ def score_jointly(drives: Sequence[DriveMatches], config: DetectionConfig) -> Fr
     names = tuple(name for name in ("vel_err", "attr_err") if name in unmeasured)
     detection = DetectionScores(sum(drive.frame_count for drive in drives), matches, names, config)
     maps = [drive.segmentation for drive in drives if drive.segmentation is not None]
-    return FrameScores(detection, _merged_maps(maps) if maps else None)
+    if not maps:
+        return FrameScores(detection)
+    labels = tuple(dict.fromkeys(label for scores in maps for label in scores.union))
+    both, either = (
+        {label: sum(of_drive.get(label, 0.0) for of_drive in cells) for label in labels}
+        for cells in ([scores.intersection for scores in maps], [scores.union for scores in maps])
+    )
+    return FrameScores(detection, SegmentationScores(both, either, sum(scores.frame_count for scores in maps)))
 
 
 def _merged(parts: Sequence[ClassMatches]) -> ClassMatches:
@@ -185,15 +192,6 @@ def _concatenated(parts: Sequence[ScoredBoxes]) -> ScoredBoxes:
     boxes = with_all_columns(Boxes3D.concatenate(scored.boxes for scored in parts))
     frames = np.concatenate([scored.frames for scored in parts])
     return ScoredBoxes(boxes, frames, np.concatenate([scored.ranges_m for scored in parts]))
-
-
-def _merged_maps(drives: Sequence[SegmentationScores]) -> SegmentationScores:
-    names = dict.fromkeys(name for scores in drives for name in scores.union)
-    return SegmentationScores(
-        {name: sum(scores.intersection.get(name, 0.0) for scores in drives) for name in names},
-        {name: sum(scores.union.get(name, 0.0) for scores in drives) for name in names},
-        sum(scores.frame_count for scores in drives),
-    )
 
 
 def write_report(records: Sequence[Record], metrics: dict[str, Any] | None, model: Model) -> str:

@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from bevcli.errors import BevcliError
-from bevcli.frame import Drive
 from bevcli.inference.load import Model
 from bevcli.inference.machine import THREAD_SETTINGS, keep_freed_memory
 from bevcli.parsing.files import is_there
@@ -66,7 +65,10 @@ class Worker:
             yield done
             return
         marker = f"{storage.ATTEMPTS}/{result}.json"
-        attempt, error = _read_marker(self._out.read(marker))
+        try:
+            attempt, error = msgspec.json.decode(self._out.read(marker) or b'[0, ""]', type=tuple[int, str])
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            attempt, error = 0, ""
         while attempt <= self._job.retries:
             attempt += 1
             died = f"the worker died in attempt {attempt} of {self._job.retries + 1} (out of memory, or a crash)"
@@ -113,6 +115,11 @@ class Worker:
             seconds = time.perf_counter() - fetched
             scores, why_not = self._score(drive, path, aside)
             content: dict[str, Any] = summary.to_dict()
+            agreement = {}
+            if scores is None:
+                found = agreement_of_run(aside, sequence)  # with the witness, which needs no ground truth
+                values = {"agreement": found.score, "agreement_low": found.low, "agreement_high": found.high}
+                agreement = {name: None if value is None else round(value, 4) for name, value in values.items()}
             record = {
                 **_about(drive, result),
                 "attempts": attempt,
@@ -126,10 +133,13 @@ class Worker:
                 "score_histogram": histogram.tolist(),
                 "scores": None if scores is None else _score_columns(scores),
                 "not_scored": why_not,
-                **(_agreement_columns(sequence, aside) if scores is None else {}),
+                **agreement,
                 "input_errors": "; ".join(summary.input_errors),
             }
-            _rewrite_paths(aside, f"{self._out.where}/{storage.RESULTS}/{result}")
+            content = json.loads((aside / SUMMARY).read_text(encoding="utf-8"))
+            final = f"{self._out.where}/{storage.RESULTS}/{result}"
+            content["files"] = [_with_final_paths(name, (aside, final)) for name in content["files"]]
+            (aside / SUMMARY).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
             (aside / storage.RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
             landed = read_record(self._out.read(f"{storage.RESULTS}/{result}/{storage.RECORD}"), result)
             if landed is not None:
@@ -202,13 +212,6 @@ def _score_columns(scores: Scores) -> Record:
     return {**defined, "ground_truth_boxes": scores.detection.overall.ground_truth_count}
 
 
-def _agreement_columns(sequence: Drive, aside: Path) -> Record:
-    """The agreement of the boxes with the witness, which needs no ground truth."""
-    found = agreement_of_run(aside, sequence)
-    values = {"agreement": found.score, "agreement_low": found.low, "agreement_high": found.high}
-    return {name: None if value is None else round(value, 4) for name, value in values.items()}
-
-
 def _fetched(drive: BatchDrive, job: Job, inputs: Path) -> Path:
     """A local path of a drive's input; of a URL, a copy with the same name."""
     if not storage.is_url(drive.source):
@@ -226,22 +229,6 @@ def _with_final_paths(message: str, *pairs: tuple[Path, str]) -> str:
     for path, name in pairs:
         message = message.replace(str(path), name)
     return message
-
-
-def _rewrite_paths(aside: Path, target: str) -> None:
-    """Names the final paths in summary.json."""
-    path = aside / SUMMARY
-    content = json.loads(path.read_text(encoding="utf-8"))
-    content["files"] = [_with_final_paths(name, (aside, target)) for name in content["files"]]
-    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def _read_marker(content: bytes | None) -> tuple[int, str]:
-    """Number and error of the last attempt; 0 without one."""
-    try:
-        return msgspec.json.decode(content or b'[0, ""]', type=tuple[int, str])
-    except (msgspec.MsgspecError, ValueError, RecursionError):
-        return 0, ""
 
 
 OBJECT_STORE_BYTES = 100 << 20  # it holds a drive and a record per worker

@@ -350,10 +350,7 @@ def measure_speed() -> dict[str, str]:
             rows[f"{model} {precision}"] = (
                 f"{1000 * median(timed):.0f} ms a frame ({span}, {counted(len(timed), 'frames')})"
             )
-    return rows | {"load": _load()}
-
-
-def _load() -> str:
-    if not hasattr(os, "getloadavg"):
-        return "not known on this system"
-    return f"{os.getloadavg()[0]:.1f} processes wanted a core in the last minute, this one included"
+    load = "not known on this system"
+    if hasattr(os, "getloadavg"):
+        load = f"{os.getloadavg()[0]:.1f} processes wanted a core in the last minute, this one included"
+    return rows | {"load": load}

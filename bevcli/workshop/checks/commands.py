@@ -59,11 +59,6 @@ def without_user(text: str) -> str:
     return one_line(text)
 
 
-def as_text(facts: dict[str, Facts]) -> str:
-    """All facts, for a terminal."""
-    return "\n".join(line for title, fact in facts.items() for line in _lines(title, fact))
-
-
 def _lines(title: str, fact: Facts) -> Iterator[str]:
     if isinstance(fact, dict) and all(len(text) <= SHORT for text in fact.values()):
         fact = ", ".join(f"{name}{TIED}{text}" for name, text in fact.items())
@@ -222,4 +217,5 @@ def checks(options: ChecksOptions, as_json: Json = False) -> None:
 
         print_note("measuring for about a minute; nothing else should run on the machine")
         facts["speed"] = tell(measure_speed)
-    say(json.dumps(facts, indent=1) if as_json else as_text(facts))
+    lines = (line for title, fact in facts.items() for line in _lines(title, fact))
+    say(json.dumps(facts, indent=1) if as_json else "\n".join(lines))

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -174,13 +174,14 @@ class Engine(LoadedFile):
                 cached = exact.opened(engine)
             if frames is not None:
                 _note(f"calibrating {model.name} with {frames.name}, {ONCE}")
-                images = calibration_images(sized.config, cached.network.cameras, [frames], CALIBRATION_FRAMES)
+                images = calibration_images(sized.config, cached[0].cameras, [frames], CALIBRATION_FRAMES)
                 with file.written() as path:
                     quantize(exact.path, images, path)
                 cached = file.opened(engine, frames.name)
-        calibrated = f", calibrated with {cached.calibrated_with}" if cached.calibrated_with else ""
+        network, calibrated_with = cached
+        calibrated = f", calibrated with {calibrated_with}" if calibrated_with else ""
         note = f"engine {model.engine}, {model.precision}{calibrated}; the exported file is {file.path}"
-        return replace(model, network=cached.network, file=file.path, engine_note=note)
+        return replace(model, network=network, file=file.path, engine_note=note)
 
 
 def _note(text: str) -> None:
@@ -334,13 +335,6 @@ class FileFacts(msgspec.Struct, frozen=True):
     calibrated_with: str = ""
 
 
-class CachedNetwork(NamedTuple):
-    """A file of the cache in an engine, and the name of the drive that calibrated it, "" for float32."""
-
-    network: ExportedModel
-    calibrated_with: str
-
-
 @dataclass(frozen=True)
 class CachedFile:
     """A file of the cache. key: hash of everything that its contents depend on."""
@@ -366,8 +360,11 @@ class CachedFile:
             return ()
         return (self.path, *((stat.st_ino, stat.st_size) for stat in stats))
 
-    def load(self, engine: type[Engine]) -> CachedNetwork | None:
-        """The file in an engine; None where it is missing or broken. Raises BevcliError for a missing engine."""
+    def load(self, engine: type[Engine]) -> tuple[ExportedModel, str] | None:
+        """The file in an engine, and the name of the drive that calibrated it, "" for float32.
+
+        None where it is missing or broken. Raises BevcliError for a missing engine.
+        """
         return _load(self, engine, self.stamp)  # type: ignore[arg-type]  # mypy takes a class for its instances
 
     @contextmanager
@@ -381,16 +378,16 @@ class CachedFile:
         with whole_file(self.path, parents=True) as unfinished:
             yield unfinished
 
-    def opened(self, engine: type[Engine], calibrated_with: str = "") -> CachedNetwork:
+    def opened(self, engine: type[Engine], calibrated_with: str = "") -> tuple[ExportedModel, str]:
         """The file in an engine, after it was written; its facts are kept beside it."""
         network = engine.open(self.path)
         file_facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
         write_whole(self.facts_path, msgspec.json.encode(file_facts))
-        return CachedNetwork(network, calibrated_with)
+        return network, calibrated_with
 
 
 @lru_cache(maxsize=1)
-def _load(file: CachedFile, engine: type[Engine], stamp: object) -> CachedNetwork | None:
+def _load(file: CachedFile, engine: type[Engine], stamp: object) -> tuple[ExportedModel, str] | None:
     """See `CachedFile.load`; the last file is kept for the next drive."""
     if not stamp:
         return None
@@ -403,7 +400,7 @@ def _load(file: CachedFile, engine: type[Engine], stamp: object) -> CachedNetwor
         return None
     with suppress(OSError):  # a cache that cannot be written can be read
         os.utime(file.path)
-    return CachedNetwork(network, file_facts.calibrated_with)
+    return network, file_facts.calibrated_with
 
 
 def _options(sized: Model, rig: CameraRig, deformable_convolution: DeformableConvolution) -> OnnxOptions:

@@ -155,8 +155,7 @@ class SlottedHits:
 
     camera: Tensor  # (Y·X, K) int64, the camera of each slot, any camera where it is empty
     filled: Tensor  # (Y·X, K) float32, 1 for a slot with a camera that sees the cell, else 0
-    # (Y·X, K, Z, 2) float32, the points of the cell's pillar in the slot's camera, 0 to 1 over the padded image
-    reference_points: Tensor
+    reference_points: Tensor  # (Y·X, K, Z, 2) float32, of the pillars in their cameras, 0 to 1 over the padded image
     cameras_per_cell: Tensor  # (Y·X, 1) float32, the number of cameras that see a cell, at least 1
     most_cameras: Tensor  # (1,) int64, the largest number of cameras that see one cell. Those beyond K have no slot
 

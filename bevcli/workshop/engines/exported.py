@@ -158,8 +158,7 @@ class FrameDifference:
     near: float  # share of the box centres that differ by at most 0.1 m, 0 to 1
     code: float  # of the other numbers of the box codes: logarithms of sizes, sine and cosine, m/s
     masks: float  # of the probabilities of the map's cells; 0 without segmentation
-    # of each output that only this model has, by its name in the file
-    further: Mapping[str, float] = field(default_factory=dict)
+    further: Mapping[str, float] = field(default_factory=dict)  # of outputs that only this model has, by name
 
 
 def check_exported(

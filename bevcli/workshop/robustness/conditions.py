@@ -132,19 +132,18 @@ class FrameLost(LostImages):
 class CalibrationNoise(ChangedDrive):
     """A sequence whose cameras state wrong poses, the same ones for a whole scene; levels of `camera_pose_noise`."""
 
-    # A rig, its scene and the noisy rig, which the frames of a scene with one rig share.
-    _noisy: tuple[CameraRig, str, CameraRig] | None = None
+    _noisy: tuple[CameraRig, str, CameraRig] | None = None  # a rig, its scene and the noisy rig that its frames share
 
     def change(self, index: int, frame: Frame) -> Frame:
         stamp = frame.stamp
         if self._noisy is None or self._noisy[0] is not frame.rig or self._noisy[1] != stamp.scene:
-            cameras = tuple(self._with_noise(camera, stamp) for camera in frame.rig.cameras)
+            noise = {name: camera_pose_noise(self._level, self.random(stamp, name)) for name in frame.rig.names}
+            cameras = tuple(
+                replace(camera, ego_from_camera=camera.ego_from_camera @ noise[camera.name])
+                for camera in frame.rig.cameras
+            )
             self._noisy = (frame.rig, stamp.scene, replace(frame.rig, cameras=cameras))
         return replace(frame, rig=self._noisy[2])
-
-    def _with_noise(self, camera: Camera, stamp: FrameStamp) -> Camera:
-        noise = camera_pose_noise(self._level, self.random(stamp, camera.name))
-        return replace(camera, ego_from_camera=camera.ego_from_camera @ noise)
 
 
 class BodyPitch(ChangedDrive):

@@ -1,5 +1,6 @@
 """`stress`: runs a model over the same drives under each condition and scores each; stress.json and its table."""
 
+import contextlib
 import json
 import math
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -280,7 +281,10 @@ class StressTest:
             return
         boxes: list[tuple[Boxes3D, Boxes3D]] = []
         for changed in condition.sequences(scene, options.seed, options.lost_images):
-            drive = _calibrated(changed) if options.calibrate else changed
+            drive = changed
+            if options.calibrate:
+                with contextlib.suppress(InputError):  # a drive that shows no rig keeps its own
+                    drive = DriveView(changed, rig=calibrate(changed).rig)
             for frame, prediction, _ in runner.run(drive):
                 if frame.ground_truth is not None:
                     boxes.append(boxes_ego(frame, frame.ground_truth, prediction, self._metrics.classes))
@@ -302,14 +306,6 @@ class StressTest:
         path = self._folder.path / RESULTS
         self._folder.add(path)
         write_whole(path, (json.dumps(self.results.to_dict(self._against), indent=1) + "\n").encode())
-
-
-def _calibrated(drive: Drive) -> Drive:
-    """The drive with the rig that it shows; itself where it shows none."""
-    try:
-        return DriveView(drive, rig=calibrate(drive).rig)
-    except InputError:
-        return drive
 
 
 def split_scenes(drive: Drive) -> list[Drive]:

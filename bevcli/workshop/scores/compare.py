@@ -292,8 +292,8 @@ def compare(
         )
     if resamples < 1:
         raise ConfigError(f"`resamples` is {resamples} (expected 1 or more)")
-    which: dict[str, Any] = {"scene": scene, "version": version, "split": split, "class_map": class_map}
-    models = [read(path, ground_truth, count_missing, **which) for path in (a, b)]
+    part = {"scene": scene, "version": version, "split": split}
+    models = [read(path, ground_truth, count_missing, class_map, part) for path in (a, b)]
     models, notes = _on_common_ground(models, max_range)
     scores = [score(model) for model in models]
     models = [replace(model, detection=scored.detection) for model, scored in zip(models, scores, strict=True)]

@@ -47,8 +47,7 @@ class ClassMatches:
     name: str  # of the class
     ground_truth: ScoredBoxes  # G boxes
     predictions: ScoredBoxes  # P boxes, sorted by descending score
-    # (D, P), the index of the ground truth that each prediction matches, -1 for a false positive
-    matched: NDArray[np.int64]
+    matched: NDArray[np.int64]  # (D, P), the ground truth that each prediction matches, -1 for a false positive
     truth_counts: NDArray[np.bool_]  # (G,), bool, the ground truths that are scored
     counts: NDArray[np.bool_]  # (D, P), bool, the predictions that are scored
 

@@ -4,7 +4,7 @@ Scores become a dict for JSON, with the key names of the nuScenes devkit, and ta
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,8 +39,7 @@ _ERROR_HEADS = ("ATE m", "ASE", "AOE rad", "AVE m/s", "AAE")
 class SegmentationScores:
     """The scores of maps: IoU in cells, each summed over all frames."""
 
-    # by class, cells that have the class in prediction and ground truth, over all maps
-    intersection: Mapping[str, float]
+    intersection: Mapping[str, float]  # by class, cells that have it in prediction and ground truth, over all maps
     union: Mapping[str, float]  # by class, cells that have it in prediction or ground truth, over all maps
     frame_count: int  # number of pairs of maps
 
@@ -55,8 +54,7 @@ class FrameScores:
     """The scores of the boxes, maps and further results of some frames."""
 
     detection: DetectionScores  # the scores of the boxes
-    # the scores of the maps; None where predictions or ground truth have none
-    segmentation: SegmentationScores | None = None
+    segmentation: SegmentationScores | None = None  # None where predictions or ground truth have no maps
     tracking: TrackingScores | None = None  # the scores of tracks
     vad: DrivingScores | None = None  # those of lines of the map, forecasts and planned paths
     worst: WorstFrames | None = None  # the frames with most missed and most invented boxes
@@ -69,7 +67,45 @@ class FrameScores:
 
     def to_dict(self) -> dict[str, Any]:
         """All scores as a dict for JSON; undefined numbers are None. docs/scoring.md explains the keys."""
-        content = _content(self)
+        detection, maps, config = self.detection, self.segmentation, self.detection.config
+        present = detection.overall.of_classes_with_ground_truth()
+        content = {
+            **_table_to_dict(detection.overall),
+            "classes_with_ground_truth": {
+                "classes": list(present.classes),
+                "mean_ap": present.mean_ap,
+                "nd_score": present.nd_score,
+            },
+            "by_range": [
+                {"from_m": low, "to_m": high, **_table_to_dict(table)}
+                for (low, high), table in detection.by_range.items()
+            ],
+            "recall_by_visibility": [
+                {
+                    "from": low,
+                    "to": high,
+                    "recall": table.mean_recall,
+                    "ground_truth_boxes": table.ground_truth_count,
+                    "found_boxes": table.prediction_count,
+                    "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
+                }
+                for (low, high), table in detection.by_visibility.items()
+            ],
+            "iou": None if maps is None else dict(maps.iou),
+            "frames": detection.frame_count,
+            "map_frames": 0 if maps is None else maps.frame_count,
+            "ground_truth_boxes": detection.overall.ground_truth_count,
+            "prediction_boxes": detection.overall.prediction_count,
+            "notes": list(self.notes),
+            "cfg": {
+                "class_range": dict(config.class_ranges_m),
+                "dist_ths": list(config.distances_m),
+                "dist_th_tp": config.error_distance_m,
+                "min_recall": config.min_recall,
+                "min_precision": config.min_precision,
+                "mean_ap_weight": config.mean_ap_weight,
+            },
+        }
         for scores in self.others:
             content |= scores.to_dict()
         return finite(content)
@@ -83,10 +119,14 @@ class FrameScores:
         """The tables of that text, with their numbers."""
         yield _classes(self.detection)
         yield _ranges(self.detection)
-        if self.detection.by_visibility:
-            yield _visibilities(self.detection)
-        if self.segmentation is not None:
-            yield _maps(self.segmentation)
+        if bins := self.detection.by_visibility:
+            rows = [
+                (f"{100 * low:.0f}-{100 * high:.0f} %", t.ground_truth_count, t.prediction_count, t.mean_recall)
+                for (low, high), t in bins.items()
+            ]
+            yield Table("visibility", ("visibility", "boxes", "found", "recall, mean over classes"), rows)
+        if (maps := self.segmentation) is not None:
+            yield Table("maps", ("map class", "IoU"), list(maps.iou.items()), below=f"\n({maps.frame_count} maps)")
         for scores in self.others:
             yield from scores.tables()
 
@@ -145,29 +185,25 @@ def evaluate(
         TypeError: `results` has an unknown option.
     """
     options = ResultOptions(**results)  # type: ignore[arg-type]
-    compared = read(
-        predictions, ground_truth, count_missing, scene=scene, version=version, split=split, class_map=class_map
-    )
+    part = {"scene": scene, "version": version, "split": split}
+    compared = read(predictions, ground_truth, count_missing, class_map, part)
     return score(replace(compared, max_range_m=max_range), options)
 
 
 def read(
     predictions: Path | str,
     ground_truth: Path | str,
-    count_missing: bool = False,
-    *,
-    scene: str | None = None,
-    version: str | None = None,
-    split: str | None = None,
-    class_map: Mapping[str, str] | None = None,
+    count_missing: bool,
+    class_map: Mapping[str, str] | None,
+    part: Mapping[str, str | None],
 ) -> inputs.Compared:
     """Read predictions and ground truth, and match their frames. Arguments and errors are those of `evaluate`."""
     predicted = inputs.open_predictions(Path(predictions), class_map)
-    classes = predicted.boxes.classes or NUSCENES_CLASSES
-    truth = inputs.open_ground_truth(Path(ground_truth), NuScenesOptions(version, split), scene, class_map, classes)
+    classes, options = predicted.boxes.classes or NUSCENES_CLASSES, NuScenesOptions(part["version"], part["split"])
+    truth = inputs.open_ground_truth(Path(ground_truth), options, part["scene"], class_map, classes)
     pairs = inputs.pair_frames(predicted.boxes, truth.boxes, count_missing=count_missing)
     pairs = inputs.without_cycles_in_racks(pairs, truth.bicycle_racks)
-    selection = {key: value for key, value in (("scene", scene), ("version", version), ("split", split)) if value}
+    selection = {name: value for name, value in part.items() if value}
     return inputs.Compared(pairs, classes, None, predicted, truth, selection=selection)
 
 
@@ -183,8 +219,7 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
         model_range = None
     limit = max_range if model_range is None else model_range
     config = DetectionConfig.of(classes).for_frames(limit, ego_pose_known=pairs.ego_pose_known)
-    predicted_boxes, true_boxes = pairs.boxes
-    scored = predicted_boxes
+    scored, true_boxes = pairs.boxes
     if all(boxes.attributes is None for boxes in scored):
         scored = [replace(boxes, attributes=attributes_by_speed(boxes, classes)) for boxes in scored]
     detection = evaluate_detections(scored, true_boxes, config, pairs.ego_xy)
@@ -201,9 +236,7 @@ def score(compared: inputs.Compared, results: ResultOptions = ResultOptions()) -
     notes = (
         *pairs.notes,
         *map_notes,
-        *_class_notes(predicted_boxes, true_boxes, classes),
-        *_range_notes(max_range, model_range, pairs),
-        *_detection_notes(detection),
+        *_notes(detection, pairs, max_range, model_range),
         *(note for result in scores.others for note in result.notes),
     )
     if impossible := truth.impossible_boxes:
@@ -218,16 +251,6 @@ def boxes_ego(
     predicted = prediction.boxes_ego
     predicted = replace(predicted, attributes=attributes_by_speed(predicted, classes))
     return predicted, ground_truth.transformed(inverse(frame.world_from_ego.matrix))
-
-
-def _range_notes(max_range: float | None, model_range: float | None, pairs: inputs.FramePairs) -> Iterator[str]:
-    if max_range is None and not pairs.ego_pose_known:
-        yield 'no frame has "world_from_ego": class ranges are not applied (`max_range` (`--max-range M`) applies them)'
-    if model_range is not None:
-        yield (
-            f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
-            "there (`max_range` (`--max-range M`) sets another limit)"
-        )
 
 
 def _score_maps(
@@ -292,17 +315,21 @@ def _at_ground_truth_cells(prediction: BevMap, truth: BevMap) -> tuple[NDArray[n
     return predicted.ravel(), truth.cells[np.ix_(rows_inside, columns_inside)].ravel()
 
 
-def _class_notes(
-    predicted: Sequence[Boxes3D], true: Sequence[Boxes3D], classes: Mapping[str, ObjectClass]
+def _notes(
+    detection: DetectionScores, pairs: inputs.FramePairs, max_range: float | None, model_range: float | None
 ) -> Iterator[str]:
-    """Name the classes on each side that are not scored."""
-    if not are_nuscenes(classes):
+    predicted, true = pairs.boxes
+    if not are_nuscenes(detection.config.classes):
         yield OWN_CLASSES
     for side, frames in (("the ground truth", true), ("the predictions", predicted)):
-        yield from ClassNames(classes=classes).note(count_classes(frames), side)
-
-
-def _detection_notes(detection: DetectionScores) -> Iterator[str]:
+        yield from ClassNames(classes=detection.config.classes).note(count_classes(frames), side)
+    if max_range is None and not pairs.ego_pose_known:
+        yield 'no frame has "world_from_ego": class ranges are not applied (`max_range` (`--max-range M`) applies them)'
+    if model_range is not None:
+        yield (
+            f"nothing beyond {model_range:g} m is scored: the BEV grid of the model that made the predictions ends "
+            "there (`max_range` (`--max-range M`) sets another limit)"
+        )
     if not detection.overall.prediction_count:
         yield "the predictions contain no box within the class ranges: every score is 0"
     classes = detection.overall.classes
@@ -319,47 +346,6 @@ def _detection_notes(detection: DetectionScores) -> Iterator[str]:
         names = {"vel_err": "velocities", "attr_err": "attributes"}
         missing = " or ".join(names[name] for name in detection.unmeasured)
         yield f"the ground truth has no {missing}: NDS is the mean without that error"
-
-
-def _content(scores: FrameScores) -> dict[str, Any]:
-    detection, segmentation = scores.detection, scores.segmentation
-    present, config = detection.overall.of_classes_with_ground_truth(), detection.config
-    return {
-        **_table_to_dict(detection.overall),
-        "classes_with_ground_truth": {
-            "classes": list(present.classes),
-            "mean_ap": present.mean_ap,
-            "nd_score": present.nd_score,
-        },
-        "by_range": [
-            {"from_m": low, "to_m": high, **_table_to_dict(table)} for (low, high), table in detection.by_range.items()
-        ],
-        "recall_by_visibility": [
-            {
-                "from": low,
-                "to": high,
-                "recall": table.mean_recall,
-                "ground_truth_boxes": table.ground_truth_count,
-                "found_boxes": table.prediction_count,
-                "label_recalls": {name: scores.recall for name, scores in table.classes.items()},
-            }
-            for (low, high), table in detection.by_visibility.items()
-        ],
-        "iou": None if segmentation is None else dict(segmentation.iou),
-        "frames": detection.frame_count,
-        "map_frames": 0 if segmentation is None else segmentation.frame_count,
-        "ground_truth_boxes": detection.overall.ground_truth_count,
-        "prediction_boxes": detection.overall.prediction_count,
-        "notes": list(scores.notes),
-        "cfg": {
-            "class_range": dict(config.class_ranges_m),
-            "dist_ths": list(config.distances_m),
-            "dist_th_tp": config.error_distance_m,
-            "min_recall": config.min_recall,
-            "min_precision": config.min_precision,
-            "mean_ap_weight": config.mean_ap_weight,
-        },
-    }
 
 
 def _table_to_dict(table: ScoreTable) -> dict[str, Any]:
@@ -411,16 +397,3 @@ def _ranges(detection: DetectionScores) -> Table:
     rows.append(("mAP", *(table.mean_ap for table in bins.values())))
     rows.append(("NDS", *(table.nd_score for table in bins.values())))
     return Table("AP by range", ("AP by range", *(f"{low:g}-{high:g} m" for low, high in bins)), rows)
-
-
-def _visibilities(detection: DetectionScores) -> Table:
-    rows = [
-        (f"{100 * low:.0f}-{100 * high:.0f} %", table.ground_truth_count, table.prediction_count, table.mean_recall)
-        for (low, high), table in detection.by_visibility.items()
-    ]
-    return Table("visibility", ("visibility", "boxes", "found", "recall, mean over classes"), rows)
-
-
-def _maps(segmentation: SegmentationScores) -> Table:
-    below = f"\n({segmentation.frame_count} maps)"
-    return Table("maps", ("map class", "IoU"), list(segmentation.iou.items()), below=below)

@@ -35,8 +35,7 @@ class ScoredInput:
     path: Path  # the boxes file, or the drive
     maps: MapFolder | None = None  # None where there is no folder of maps
     open_drive: Callable[[], Drive] | None = None  # opens the ground truth as a drive; None of a boxes file
-    # by sample token, in the world frame; only of a nuScenes root
-    bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)
+    bicycle_racks: Mapping[str, Boxes3D] = field(default_factory=dict)  # of nuScenes, by sample token, world
     impossible_boxes: int = 0  # the number of boxes that were left out: a size of 0 or less, or not finite
 
     @property
@@ -64,7 +63,8 @@ def open_predictions(path: Path, class_map: Mapping[str, str] | None = None) -> 
                 f'{file}: frame {frame.stamp.index}: boxes have no "score" (expected in predictions): '
                 "is this a ground truth file?"
             )
-    return ScoredInput(boxes, file, _maps_next_to(file, "segmentation"))
+    maps = file.parent / "segmentation"
+    return ScoredInput(boxes, file, open_maps(maps) if maps.is_dir() else None)
 
 
 def open_ground_truth(
@@ -91,12 +91,8 @@ def open_ground_truth(
         if not kept:
             raise InputError(f'{file}: has no scene "{scene}"')
         boxes = replace(boxes, frames=kept)
-    return ScoredInput(boxes, file, _maps_next_to(file, "ground_truth_map"))
-
-
-def _maps_next_to(file: Path, name: str) -> MapFolder | None:
-    folder = file.parent / name
-    return open_maps(folder) if folder.is_dir() else None
+    maps = file.parent / "ground_truth_map"
+    return ScoredInput(boxes, file, open_maps(maps) if maps.is_dir() else None)
 
 
 def _open_nuscenes(root: Path, options: NuScenesOptions, only: str | None, names: ClassNames) -> ScoredInput:
@@ -185,7 +181,10 @@ def pair_frames(predictions: BoxesFile, ground_truth: BoxesFile, *, count_missin
         pairs += [(replace(true, world_from_ego=None, boxes=Boxes3D.empty()), true) for true in missing]
     if predictions.extras.get("ego_motion") == "measured" and predictions.frame_of_reference == "world":
         pairs = [(_in_world_of(prediction, true), true) for prediction, true in pairs]
-    reference = _common_frame_of_reference(predictions, ground_truth)
+    references = {predictions.frame_of_reference, ground_truth.frame_of_reference}
+    reference = "world" if "world" in references else "ego"
+    if references == {"bev"} and not (predictions.ego_from_bev and ground_truth.ego_from_bev):
+        reference = "bev"
     ego_from_bev = predictions.ego_from_bev or ground_truth.ego_from_bev
     poses = [true.world_from_ego or prediction.world_from_ego for prediction, true in pairs]
     return FramePairs(
@@ -236,7 +235,7 @@ def _common_frames(
             raise InputError(f"the {name} contain no frame (expected at least one)")
     for name, key in _KEYS.items():
         of_truth, of_predictions = (list(map(key, side)) for side in (ground_truth, predictions))
-        if _ambiguous(of_truth) or _ambiguous(of_predictions):
+        if any(None in keys or len(set(keys)) < len(keys) for keys in (of_truth, of_predictions)):  # ambiguous
             continue
         truth = dict(zip(of_truth, ground_truth, strict=True))
         pairs = [
@@ -250,19 +249,8 @@ def _common_frames(
     )
 
 
-def _ambiguous(keys: Sequence[Hashable]) -> bool:
-    return None in keys or len(set(keys)) < len(keys)
-
-
 def _described(frame: FrameBoxes) -> str:
     return f'scene "{frame.stamp.scene}" frame {frame.stamp.index} at {frame.stamp.timestamp_ns} ns'
-
-
-def _common_frame_of_reference(predictions: BoxesFile, ground_truth: BoxesFile) -> str:
-    references = {predictions.frame_of_reference, ground_truth.frame_of_reference}
-    if "world" in references:
-        return "world"
-    return "bev" if references == {"bev"} and not (predictions.ego_from_bev and ground_truth.ego_from_bev) else "ego"
 
 
 def _transformed(frame: FrameBoxes, file: BoxesFile, reference: str, world_from_ego: Pose | None) -> FrameBoxes:
@@ -336,21 +324,12 @@ def _outside(frame: FrameBoxes, racks: Boxes3D) -> FrameBoxes:
 
 @dataclass(frozen=True)
 class Compared:
-    """Predictions and ground truth of the same frames.
+    """Predictions and ground truth of the same frames."""
 
-    Attributes:
-        pairs: the frames that are scored.
-        classes: of the predictions, by name.
-        max_range_m: distance from the ego vehicle beyond which nothing is scored; None for the range of each class.
-        predictions, truth: with all their frames, and where they come from; None of frames in memory.
-        detection: the scores of the boxes; None where they are not computed.
-        selection: what was read of the ground truth: "scene", "version" and "split", where given.
-    """
-
-    pairs: FramePairs
-    classes: Mapping[str, ObjectClass]
-    max_range_m: float | None
-    predictions: ScoredInput | None = None
-    truth: ScoredInput | None = None
-    detection: DetectionScores | None = None
-    selection: Mapping[str, str] = field(default_factory=dict)
+    pairs: FramePairs  # the frames that are scored
+    classes: Mapping[str, ObjectClass]  # of the predictions, by name
+    max_range_m: float | None  # from the ego vehicle; nothing beyond is scored. None for the range of each class
+    predictions: ScoredInput | None = None  # with all frames; None of frames in memory
+    truth: ScoredInput | None = None  # with all frames; None of frames in memory
+    detection: DetectionScores | None = None  # the scores of the boxes; None where they are not computed
+    selection: Mapping[str, str] = field(default_factory=dict)  # of the ground truth: "scene", "version" and "split"

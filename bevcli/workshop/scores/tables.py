@@ -27,16 +27,13 @@ class Table:
 
     name: str  # of the table, in files
     columns: Sequence[str]  # the heads
-    # cells. NaN is printed as "-"; the columns that name a row (`left`) stay empty where the row before has the same
-    # name
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[Cell]]  # NaN is printed as "-"; cells of `left` stay empty below the same name
     digits: Mapping[str, int] = field(default_factory=dict)  # column -> decimals of its numbers; 3 for others
     signed: Collection[str] = ()  # columns whose numbers have a sign
     left: Collection[int] = (0,)  # the columns that name a row, aligned to the left
     names: Sequence[str] = ()  # of the columns in CSV; by default their heads
     below: str = ""  # printed text below the table
-    # further numbers of all rows, which stand in that text: name -> value
-    sums: Mapping[str, float] = field(default_factory=dict)
+    sums: Mapping[str, float] = field(default_factory=dict)  # numbers of all rows, which stand in `below`
 
     def __str__(self) -> str:
         return aligned([self.columns, *self._texts()], self.left) + self.below

@@ -255,9 +255,7 @@ _ERRORS = {
 class ClassTracking:
     """The tracking metrics of one class."""
 
-    # name -> value, see METRICS; all but amota and amotp at the threshold with the highest MOTA. NaN where a metric is
-    # not defined
-    metrics: Mapping[str, float]
+    metrics: Mapping[str, float]  # by METRICS, most of them at the threshold with the highest MOTA; NaN if undefined
     # name -> (K,) values at the K recall levels, level 1 first: the metrics at one threshold, "confidence" (the
     # threshold) and "recall_hypo" (the level). NaN where a level is not reached
     levels: Mapping[str, Array]
@@ -386,8 +384,12 @@ class TrackingScores:
     @property
     def overall(self) -> dict[str, float]:
         """Metric -> its sum or its mean over the classes that have ground truth; NaN where no class has any."""
-        classes = self.classes.values()
-        return {name: _over_classes(name, [scores.metrics[name] for scores in classes]) for name in METRICS}
+        overall = {}
+        for name in METRICS:
+            values = np.array([scores.metrics[name] for scores in self.classes.values()], dtype=np.float64)
+            values = values[~np.isnan(values)]
+            overall[name] = float(values.sum() if name in SUMMED else values.mean()) if len(values) else np.nan
+        return overall
 
     def to_dict(self) -> dict[str, Any]:
         config = self.config
@@ -502,10 +504,3 @@ def _require_identities(
         raise InputError(
             'predictions: no box has an "instance" (tracking metrics need identities): use `bevcli run --track`'
         )
-
-
-def _over_classes(name: str, values: Sequence[float]) -> float:
-    defined = np.array([value for value in values if not np.isnan(value)], dtype=np.float64)
-    if not len(defined):
-        return np.nan
-    return float(defined.sum() if name in SUMMED else defined.mean())

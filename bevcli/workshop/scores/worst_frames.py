@@ -49,8 +49,7 @@ class WorstFrames:
     count: int  # the largest number of frames in a list
     distance_m: float  # the matching distance
     command: tuple[str, ...] = ()  # the words of `bevcli viz` with the boxes; empty if the ground truth is not a drive
-    # index of the first frame by scene, if `bevcli viz` should open a scene whose frames count from 0
-    scene_starts: Mapping[str, int] = field(default_factory=dict)
+    scene_starts: Mapping[str, int] = field(default_factory=dict)  # first frame by scene, if frames count by scene
     notes: tuple[str, ...] = ()
 
     @property

@@ -55,29 +55,22 @@ class RandomisationConfig:
 class AugmentationConfig:
     """The [training.augmentation] table."""
 
-    # probability (0 to 1) of each distortion of an image: brightness, contrast, saturation, hue
-    photometric: float = 0.5
+    photometric: float = 0.5  # probability of each distortion of an image: brightness, contrast, saturation, hue
     grid_mask: float = 0.7  # probability (0 to 1) that a grid of grey squares covers an image
     exposure: float = 0.0  # largest change of the exposure of a camera, in stops (factors of 2); constant over a clip
     white_balance: float = 0.0  # largest relative change of a camera's red and blue; constant over a clip
     # largest standard deviation of the noise, of pixel values 0 to 255. Half of the clips have noise
     noise: float = 0.0
     drop_image: float = 0.0  # probability (0 to 1) that an image is missing. A frame keeps at least one image
-    # probability (0 to 1) that a clip has noise on the poses of its cameras; constant over a clip
-    calibration_share: float = 0.0
+    calibration_share: float = 0.0  # probability that a clip has noise on the poses of its cameras, constant over it
     calibration_noise: float = 4.0  # largest level of that noise (`camera_pose_noise`), drawn uniformly from 0
-    # probability (0 to 1) that the vehicle of a clip pitches and rolls, which its poses do not state
-    tilted_share: float = 0.0
+    tilted_share: float = 0.0  # probability that the vehicle of a clip pitches and rolls, which its poses do not state
     # largest standard deviation of that pitch, drawn uniformly from 0; of the roll half as much. Half of its variance
     # is of the whole clip, as on a slope; each frame draws the rest anew
     tilt_deg: float = 1.5
-    # probability (0 to 1) that all images of a clip are corrupted: low light, fog, snow, brightness, motion blur or few
-    # colours, of any severity
-    corrupted_share: float = 0.0
-    # probability (0 to 1) that up to `MOST_LOST_CAMERAS` cameras of a clip deliver nothing, or black images
-    lost_cameras_share: float = 0.0
-    # of the images that enter the network
-    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)
+    corrupted_share: float = 0.0  # probability that all images of a clip are corrupted (TRAINED_CORRUPTIONS)
+    lost_cameras_share: float = 0.0  # probability that up to MOST_LOST_CAMERAS cameras deliver nothing, or black images
+    randomisation: RandomisationConfig = field(default_factory=RandomisationConfig)  # of network images
 
     def __post_init__(self) -> None:
         amounts = ("exposure", "white_balance", "noise", "calibration_noise", "tilt_deg")
@@ -326,13 +319,11 @@ def mask_images(images: Tensor, probability: float, random: np.random.Generator)
         if random.random() < probability:
             height, width = image.shape[-2:]
             period = int(random.integers(2, max(3, min(height, width))))
-            rows, columns = (_stripes(extent, period, random) for extent in (height, width))
+            # True in the first half of each period, with a random phase.
+            rows, columns = (
+                (np.arange(extent) + random.integers(period)) % period < period / 2 for extent in (height, width)
+            )
             image.masked_fill_(torch.from_numpy(rows[:, None] & columns), 0)
-
-
-def _stripes(extent: int, period: int, random: np.random.Generator) -> NDArray[np.bool_]:
-    """(extent,) bool: true in the first half of each period, with a random phase."""
-    return (np.arange(extent) + random.integers(period)) % period < period / 2
 
 
 KERNEL_SIZES = (1, 3, 5, 7)

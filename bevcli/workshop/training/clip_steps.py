@@ -100,13 +100,9 @@ class DistillationLossConfig:
     """The [training.distillation_loss] table."""
 
     weight: float = 0.0  # of the mean squared difference of the BEV maps; 0 disables this part
-    # of the mean squared difference of the neck's maps, relative to the variance of the teacher's; 0 disables this
-    # part. With it the teacher sees the images that the model sees, with all augmentation
-    feature_weight: float = 0.0
+    feature_weight: float = 0.0  # of that of the neck's maps, by the teacher's variance; it then sees augmented images
     teacher: str = ""  # weights of the teacher, a file or a model's name
-    # name or TOML file of the teacher's model, which may have another backbone and normalisation of images; "" for the
-    # model that is trained
-    model: str = ""
+    model: str = ""  # name or TOML file of the teacher's model; "" for the model that is trained
 
     def __post_init__(self) -> None:
         if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
@@ -125,8 +121,7 @@ class Lesson:
     """The results of a teacher for one frame of B clips with N cameras."""
 
     bev: Tensor | None  # (B, Y·X, C) float32; None where only the features are learned
-    # (B·N, C, H, W) float32 of each level of the neck; empty where only the BEV map is learned
-    features: tuple[Tensor, ...]
+    features: tuple[Tensor, ...]  # (B·N, C, H, W) float32 of each level of the neck; empty where not learned
 
 
 class Teacher:

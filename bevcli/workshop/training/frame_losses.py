@@ -53,8 +53,7 @@ class ImageObjects:
     depths: Tensor  # (P, G) of the box centre along the optical axis, metres
     focal: Tensor  # (P,) focal length, pixels: the geometric mean of fx and fy
     log_sizes: Tensor  # (P, G, 3) logarithms of length, width, height in metres
-    # (P, G, 2) sine and cosine of the heading relative to the viewing ray (allocentric), about the z axis
-    rotations: Tensor
+    rotations: Tensor  # (P, G, 2) sine and cosine of the heading relative to the viewing ray, about the z axis
 
 
 @dataclass(frozen=True)
@@ -320,15 +319,11 @@ def perspective_loss(
 class LossConfigs:
     """The tables of [training] whose names end in _loss."""
 
-    # the detection head's
-    detection_loss: losses.DetectionLossConfig = field(default_factory=losses.DetectionLossConfig)
-    # the segmentation head's, where the model has one
-    segmentation_loss: losses.SegmentationLossConfig = field(default_factory=losses.SegmentationLossConfig)
+    detection_loss: losses.DetectionLossConfig = field(default_factory=losses.DetectionLossConfig)  # of the boxes
+    segmentation_loss: losses.SegmentationLossConfig = field(default_factory=losses.SegmentationLossConfig)  # of masks
     dense_loss: losses.DenseLossConfig = field(default_factory=losses.DenseLossConfig)  # auxiliary, on the BEV map
-    # auxiliary, on the image features
-    perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)
-    # auxiliary, against the BEV map or the image features of a teacher
-    distillation_loss: DistillationLossConfig = field(default_factory=DistillationLossConfig)
+    perspective_loss: PerspectiveLossConfig = field(default_factory=PerspectiveLossConfig)  # on image features
+    distillation_loss: DistillationLossConfig = field(default_factory=DistillationLossConfig)  # against a teacher
 
 
 class FrameLosses:

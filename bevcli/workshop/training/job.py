@@ -17,14 +17,13 @@ from torch import Tensor, nn
 
 from bevcli.config import TRAINING, load_config, load_table, settings_of_table
 from bevcli.errors import ConfigError, InputError, OutputError
-from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
 from bevcli.parsing.documents import read_json
 from bevcli.runs.state import OWN, folder_lock
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
-from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
+from bevcli.workshop.synth.rig import RigDistribution
 from bevcli.workshop.training import Log, TrainOptions
 from bevcli.workshop.training.augmentation import AugmentationConfig
 from bevcli.workshop.training.frame_losses import LossConfigs
@@ -97,9 +96,7 @@ class OptimizerConfig:
     warm_up_start: float = 1 / 3  # relative rate at step 0
     final_share: float = 1e-3  # relative rate at the end of the cosine decay
     max_gradient_norm: float = 35.0  # gradients are clipped to this L2 norm
-    # decay per update of a running average of the weights, such as 0.998; 0 for none. The average is what is evaluated
-    # and released, so that a training may end before its learning rate has decayed
-    average: float = 0.0
+    average: float = 0.0  # decay an update of a running average of the weights, which is scored and released; 0: none
 
     def __post_init__(self) -> None:
         if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
@@ -128,15 +125,9 @@ class TrainingConfig(LossConfigs):
     evaluate_every: int = 1000  # steps between evaluations
     checkpoint_every: int = 250  # steps between checkpoints
     freeze_batch_norm: bool = False  # keep the running statistics of batch norms, for fine-tuning
-    # the backbone's stem and its first stages, so many, keep their weights and the statistics of their batch norms; 0
-    # trains all of it
-    frozen_stages: int = 0
-    # processes that make batches ahead; 1 for a thread of this process. 0 is 1 on a CPU, and with a GPU all cores but
-    # two
-    loaders: int = 0
-    # share of the free memory (0 to below 1) for decoded images, of all loaders together, so that each loader decodes
-    # an image once; 0 keeps none. Batches are the same
-    kept_share: float = 0.25
+    frozen_stages: int = 0  # of the backbone, from the stem on, with their batch norms; 0 trains all of it
+    loaders: int = 0  # processes that make batches ahead, 1 for a thread; 0 is 1 on a CPU, with a GPU all cores but two
+    kept_share: float = 0.25  # share of the free memory for decoded images, of all loaders together; 0 keeps none
     weights_dtype: Literal["float32", "float16"] = "float32"  # data type of weights.safetensors
     clips: ClipConfig = field(default_factory=ClipConfig)  # how clips are drawn
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)  # image augmentation
@@ -169,10 +160,8 @@ class TrainingJob:
     group: ProcessGroup = field(default_factory=ProcessGroup)  # the processes that train together
     notes: tuple[str, ...] = ()  # about the drives, for the user
     log: Log | None = None  # where the learning curves are written, besides the CSV files; None for nowhere
-    # what the training starts from; empty for random weights, or if it is resumed
-    warm_starts: tuple[WarmStart, ...] = ()
-    # keeps other trainings out of the folder until it is closed; empty in other processes than the leader
-    lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    warm_starts: tuple[WarmStart, ...] = ()  # what it starts from; empty for random weights, or if resumed
+    lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)  # of the folder, in the leader
 
     @property
     def loaders(self) -> int:
@@ -180,12 +169,7 @@ class TrainingJob:
         if self.config.loaders or self.device.type == "cpu":
             return self.config.loaders or 1
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        return max(1, cores // _trainings_here() - CORES_OF_TRAINING)
-
-    @property
-    def kept_bytes(self) -> int:
-        """Memory for the decoded images that each loader keeps."""
-        return int(self.config.kept_share * free_memory() / (self.loaders * _trainings_here()))
+        return max(1, cores // trainings_here() - CORES_OF_TRAINING)
 
     def changed_settings(self) -> tuple[str, ...]:
         """A note where the settings differ from those of the training so far in this folder; stores them."""
@@ -198,7 +182,7 @@ class TrainingJob:
         return (f"the training goes on with other settings: {', '.join(changed)}",) if changed else ()
 
 
-def _trainings_here() -> int:
+def trainings_here() -> int:
     """Processes on this machine that train together."""
     return int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
 
@@ -239,7 +223,9 @@ def prepare_training(
     Raises BevcliError where a file, the choice of drives, or the output folder is wrong; nothing is written then.
     """
     model_config = load_config(model_name_or_file)
-    config = training_config(model_name_or_file, options)
+    config = load_table(model_name_or_file, TRAINING, TrainingConfig)
+    held_out = config.held_out if options.held_out is None else options.held_out
+    config = with_changes(replace(config, steps=options.steps or config.steps, held_out=held_out), options.changes)
     model_config.check_training(config.clips.frames)
     out = options.out or Path("runs") / f"train-{model_config.name}"
     check_folder(out, resume=options.resume)
@@ -278,24 +264,6 @@ def prepare_training(
     return TrainingJob(model, config, drives, evaluated, out, device, *rest)
 
 
-def training_config(model_name_or_file: str, options: TrainOptions = TrainOptions()) -> TrainingConfig:
-    """The [training] table of a model's file with the changes of the options. Raises ConfigError."""
-    config = load_table(model_name_or_file, TRAINING, TrainingConfig)
-    held_out = config.held_out if options.held_out is None else options.held_out
-    config = replace(config, steps=options.steps or config.steps, held_out=held_out)
-    return with_changes(config, options.changes)
-
-
-def rig_for_drives(choice: str, model: str) -> CameraRig | RigDistribution:
-    """The rig in a calibration.json, or for "random" the distribution of the [training.rigs] table of a model file.
-
-    With "random" every drive has a random rig. Raises InputError or ConfigError where a file is wrong.
-    """
-    if choice == "random":
-        return replace(load_table(model, TRAINING, TrainingConfig).rigs, random_share=1.0)
-    return rig_for_rendering(choice, None)
-
-
 def check_folder(out: Path, *, resume: bool) -> None:
     """Raises OutputError if an output folder holds a training that is not to be resumed."""
     if (out / CHECKPOINT).exists() and not resume:
@@ -316,12 +284,19 @@ def with_changes(config: TrainingConfig, changes: Mapping[str, str]) -> Training
     for key, text in changes.items():
         key = key.removeprefix(f"{TRAINING}.")
         if key not in keys:
-            raise ConfigError(f'`changes` (`--set`): unknown key "{key:.100}"; {_nearest(key, keys)}')
+            last = {name.rpartition(".")[2]: name for name in reversed(keys)}  # a key may lack its table
+            similar = difflib.get_close_matches(key, keys, 1) or [
+                last[name] for name in difflib.get_close_matches(key, last, 1)
+            ]
+            advice = f'did you mean "{similar[0]}"?' if similar else "the keys are in the table of docs/training.md"
+            raise ConfigError(f'`changes` (`--set`): unknown key "{key:.100}"; {advice}')
         *tables, name = key.split(".")
         inner = table
         for name_of_table in tables:
             inner = inner[name_of_table]
-        inner[name] = _value(text)
+        inner[name] = text
+        with contextlib.suppress(tomllib.TOMLDecodeError, KeyError):  # a text may lack its quotes
+            inner[name] = tomllib.loads(f"value = {text}")["value"]
     return settings_of_table({TRAINING: table}, TRAINING, TrainingConfig, "`changes` (`--set`)")
 
 
@@ -331,20 +306,3 @@ def _keys(config: Any, prefix: str = "") -> Iterator[str]:
             yield from _keys(value, f"{prefix}{name}.")
         else:
             yield prefix + name
-
-
-def _value(text: str) -> Any:
-    """The value of a text in TOML; the text itself where it is none."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, KeyError):
-        return text
-
-
-def _nearest(key: str, keys: list[str]) -> str:
-    """The key with the most similar name or, without its table, with the most similar last part."""
-    last = {name.rpartition(".")[2]: name for name in reversed(keys)}
-    similar = difflib.get_close_matches(key, keys, 1) or [
-        last[name] for name in difflib.get_close_matches(key, last, 1)
-    ]
-    return f'did you mean "{similar[0]}"?' if similar else "the keys are in the table of docs/training.md"

@@ -76,12 +76,8 @@ class DetectionLossConfig:
     class_weight: float = 2.0  # of the focal loss of the classes
     box_weight: float = 0.25  # of the L1 loss of the box codes
     velocity_weight: float = 0.2  # of vx and vy within the L1 loss
-    # additional factor on the velocity of moving objects (0.5 m/s or faster). If most objects are stationary, L1 alone
-    # is smallest for a model that predicts zero velocity everywhere
-    moving_weight: float = 1.0
-    # with a positive value, the class target of a query with an object is exp(-d / quality_m) instead of 1, d metres
-    # from the predicted to the true centre on the ground, so that scores rank boxes by their place
-    quality_m: float = 0.0
+    moving_weight: float = 1.0  # additional factor for moving objects: else zero everywhere may be the smallest loss
+    quality_m: float = 0.0  # above 0, class targets are exp(-d / quality_m), d metres between the centres, instead of 1
 
     def __post_init__(self) -> None:
         if min(vars(self).values()) < 0:

@@ -61,14 +61,9 @@ class ClipConfig:
 
     frames: int = 3  # frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history
     batch: int = 4  # clips of a batch
-    # share of the batches with shorter clips (0 to 1), because each scene starts without history
-    short_share: float = 0.1
-    # "last" trains on the last frame of a clip, as published. "all" trains on every frame of successive frames, with
-    # one update each; a clip's first frame has no history
-    learn: Literal["last", "all"] = "last"
-    # with "all", the number of batches a step. The updates alternate between them, so that successive updates do not
-    # see the same few streets
-    in_turn: int = 1
+    short_share: float = 0.1  # of the batches, with shorter clips, because each scene starts without history
+    learn: Literal["last", "all"] = "last"  # frames of a clip to train on; "last" as published
+    in_turn: int = 1  # with "all", batches a step, whose updates alternate: successive ones see other streets
 
     def __post_init__(self) -> None:
         if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
@@ -152,14 +147,11 @@ def draw_frames(sequence: Drive, count: int, random: np.random.Generator, *, wit
 class Batch:
     """B clips of the same length."""
 
-    # the network inputs, one a frame of the clips, each for B clips; images may be in bytes
-    inputs: tuple[ModelInputs, ...]
+    inputs: tuple[ModelInputs, ...]  # one a frame of the clips, each for B clips; images may be in bytes
     world_from_bev: Tensor  # (frames, B, 4, 4) float64, the poses of the bev frames, metres
-    # of the last frames of the clips. There are fewer than inputs if the first frames are history only
-    targets: tuple[Targets, ...]
+    targets: tuple[Targets, ...]  # of the last frames; fewer than inputs if the first ones are history only
     plain: "Batch | None" = None  # the same clips before augmentation, for a teacher; None without one
-    # (B, N, 4) float32 of each input: photometric ones of images in bytes; () where they are distorted
-    distortions: tuple[Tensor, ...] = ()
+    distortions: tuple[Tensor, ...] = ()  # (B, N, 4) float32, of images in bytes; () where they are distorted
 
     def to(self, device: torch.device) -> "Batch":
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
@@ -208,11 +200,6 @@ def _inputs(frames: list[PreparedFrame], config: ModelConfig) -> tuple[ModelInpu
     return tuple(model_inputs(prepared, pose, config) for prepared, pose in zip(frames, poses, strict=True))
 
 
-def _grey(image: ImageConfig) -> NDArray[np.uint8]:
-    """(3,) uint8 the pixel value of each channel that is nearest to 0 after normalisation."""
-    return np.rint(image.mean).astype(np.uint8)
-
-
 def write_bytes(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[np.uint8]) -> None:
     """As `write_network_image`, but as uint8 pixel values less the mean grey, modulo 256.
 
@@ -232,7 +219,7 @@ def write_bytes(pixels_bgr: NDArray[np.uint8], image: ImageConfig, out: NDArray[
         write_network_image(pixels_bgr, rounded, values.transpose(2, 0, 1))
         pixels = values.astype(np.uint8)
     lines = out.transpose(1, 2, 0).reshape(out.shape[1], -1)[:rows, : 3 * columns]  # faster than three by three
-    np.subtract(pixels.reshape(rows, -1), np.tile(_grey(image), columns), out=lines)
+    np.subtract(pixels.reshape(rows, -1), np.tile(np.rint(image.mean).astype(np.uint8), columns), out=lines)
 
 
 def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | None = None) -> Tensor:
@@ -241,7 +228,7 @@ def images_from_bytes(images: Tensor, image: ImageConfig, distortions: Tensor | 
     distortions: (B, N, 4), photometric. What is 0 in all channels (padding, missing images, masks) stays 0.
     """
     flat = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)
-    of_channels = torch.tensor([_grey(image).tolist(), image.mean, image.std], dtype=torch.float32)
+    of_channels = torch.tensor([np.rint(image.mean).tolist(), image.mean, image.std], dtype=torch.float32)
     grey, mean, std = upload(of_channels, flat.device)[..., None, None].unbind(0)  # (3, 1, 1) each
     pixels = (flat + grey.to(torch.uint8)).float()
     if distortions is not None:

@@ -100,8 +100,7 @@ SAMPLES = 8  # sampling points along each side of a BEV cell
 class SegmentationTargets:
     """The masks of one frame: S stuff classes and G vehicles."""
 
-    # (S, Y·X) float32 masks of 0 and 1 in the order of STUFF_CLASSES; None if the frame has no map
-    stuff: Tensor | None
+    stuff: Tensor | None  # (S, Y·X) float32, 0 or 1, in the order of STUFF_CLASSES; None without a map
     things: Tensor  # (G, Y·X) float32 masks of 0 and 1
     locations: Tensor  # (G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid
 

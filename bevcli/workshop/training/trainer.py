@@ -16,7 +16,9 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from bevcli.config import TRAINING, load_table
 from bevcli.errors import BevcliError, InputError, WeightsError
+from bevcli.geometry.cameras import CameraRig
 from bevcli.inference import ModelOptions, StepOptions
 from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.machine import trim_memory
@@ -37,11 +39,20 @@ from bevcli.workshop.synth.drives import (
     read_split,
     scored_drives,
 )
+from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.workshop.training import TrainOptions, ValidationOptions
 from bevcli.workshop.training.augmentation import randomised
 from bevcli.workshop.training.clip_steps import FrozenStages, Lesson, Teacher, forward_clip
 from bevcli.workshop.training.frame_losses import FrameLosses
-from bevcli.workshop.training.job import CHECKPOINT, OptimizerConfig, TrainingJob, prepare_training, rig_for_drives
+from bevcli.workshop.training.job import (
+    CHECKPOINT,
+    OptimizerConfig,
+    TrainingConfig,
+    TrainingJob,
+    free_memory,
+    prepare_training,
+    trainings_here,
+)
 from bevcli.workshop.training.kernels import choose_training_kernels
 from bevcli.workshop.training.samples import Batch, BatchMaker, loaded_batches
 from bevcli.workshop.training.validation import (
@@ -74,12 +85,6 @@ def make_optimizer(trained: nn.Module, backbone: nn.Module, config: OptimizerCon
     # On a GPU, fused: one kernel instead of hundreds.
     fused = next(trained.parameters()).device.type == "cuda" or None
     return torch.optim.AdamW(groups, lr=config.learning_rate, weight_decay=config.weight_decay, fused=fused)
-
-
-def set_learning_rate(optimizer: torch.optim.AdamW, rate: float) -> None:
-    """Sets the learning rate of the next step; each parameter group takes its share of it."""
-    for group in optimizer.param_groups:
-        group["lr"] = rate * group["share"]
 
 
 @torch.no_grad()
@@ -152,8 +157,9 @@ class Trainer:
         choose_training_kernels(job.model, job.device)
         taught = job.config.distillation_loss
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
+        kept_bytes = int(job.config.kept_share * free_memory() / (job.loaders * trainings_here()))  # of each loader
         self.maker = BatchMaker(
-            KeptDrives(job.drives, FrameMemory(job.kept_bytes)),
+            KeptDrives(job.drives, FrameMemory(kept_bytes)),
             job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
             with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
             in_bytes=job.device.type == "cuda",
@@ -223,7 +229,8 @@ class Trainer:
     def _step(self, batches: Iterable[Batch]) -> Iterator[dict[str, float]]:
         """One step, with an update of the weights for each frame trained on. Yields the numbers of each."""
         job, config = self.job, self.job.config
-        set_learning_rate(self.optimizer, config.optimizer.learning_rate_at(self.done, config.steps))
+        for group in self.optimizer.param_groups:
+            group["lr"] = config.optimizer.learning_rate_at(self.done, config.steps) * group["share"]
         gpus = [job.device] if job.device.type == "cuda" else []
         frozen = contextlib.nullcontext() if self._frozen is None else self._frozen.used_by(job.model.backbone)
         with torch.random.fork_rng(gpus), self._losses.watching(job.model), frozen:
@@ -477,7 +484,11 @@ def drives_to_score(
 
     name: of the model, or its file.
     """
-    rig = None if options.rig is None else rig_for_drives(options.rig, name)
+    rig: CameraRig | RigDistribution | None = None
+    if options.rig == "random":
+        rig = replace(load_table(name, TRAINING, TrainingConfig).rigs, random_share=1.0)
+    elif options.rig is not None:
+        rig = rig_for_rendering(options.rig, None)
     drives = scored_drives(drive_options, config, rig)
     if options.odometry:
         yield from drives.measure_motion()

@@ -307,7 +307,10 @@ def draw_learning_curves(loss: LearningCurve, validation: LearningCurve, path: P
     """Writes a PNG: smoothed losses on the left, scores on the right."""
     figure = Figure(figsize=(12, 4.5), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _draw_rows(left, _smoothed(loss.rows), skipped=("step", "learning rate", "gradient norm"))
+    rows, size = loss.rows, max(1, len(loss.rows) // 200)  # of the blocks whose means are drawn
+    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
+    smooth: list[Row] = [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
+    _draw_rows(left, smooth, skipped=("step", "learning rate", "gradient norm"))
     shown = ("step", "mAP", "NDS")
     scores: list[Row] = [{k: v for k, v in row.items() if k in shown or k.startswith("IoU")} for row in validation.rows]
     _draw_rows(right, scores, skipped=("step",), marker="o")
@@ -326,13 +329,6 @@ def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str
     if rows:
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves
     axes.grid(alpha=0.3)
-
-
-def _smoothed(rows: list[Row]) -> list[Row]:
-    """Means over blocks of equal length, at least 200 blocks if there are so many rows."""
-    size = max(1, len(rows) // 200)
-    blocks = [rows[start : start + size] for start in range(0, len(rows) - size + 1, size)]
-    return [{name: sum(row[name] for row in block) / size for name in block[0]} for block in blocks]
 
 
 def _read_rows(path: Path) -> list[Row]:

@@ -73,8 +73,7 @@ class NamedRows:
 
     part: str  # the rows in words
     source: tuple[str, ...]  # names of the file's rows; empty if the file does not name them
-    # name of each row of the model -> the rows of the file that it starts from, as their mean; none for a new one
-    starts: Starts
+    starts: Starts  # row of the model -> rows of the file, of which it takes the mean; none for a new one
     remark: str = ""  # on rows that start from one of another name
 
     def fit(self, rows: Tensor, tensor: Tensor) -> bool:

@@ -30,8 +30,7 @@ class MapHeadConfig:
     """The map head. The defaults are those of the published weights."""
 
     stuff: tuple[str, ...] = ("drivable_area",)  # classes with one mask each
-    # classes of instances, in the order of the class logits
-    things: tuple[str, ...] = ("divider", "pedestrian_crossing", "contour")
+    things: tuple[str, ...] = ("divider", "pedestrian_crossing", "contour")  # in the order of the logits
     thing_queries: int = 300  # T, the number of thing queries
     max_things: int = 100  # K, the number of pairs of a query and a class that get a mask, those with the best scores
     encoder_layers: int = 6  # layers of the encoder
@@ -50,9 +49,7 @@ class MapHeadConfig:
     min_mask: float = 0.5  # value of a mask above which a cell belongs to it
     min_score: float = 0.1  # things with a lower score are left out
     max_overlap: float = 0.4  # a thing is left out if a larger share of its cells belongs to things with better scores
-    # x, y in metres, bev frame, added to the cells of things: the published weights were trained with lines around the
-    # ego origin and drivable area around the lidar, which is 0.94 m further ahead
-    thing_offset_m: tuple[float, float] = (0.0, -0.94)
+    thing_offset_m: tuple[float, float] = (0.0, -0.94)  # added to cells of things (see docs/bevformer.md)
 
     def __post_init__(self) -> None:
         count = len(self.classes)
@@ -86,13 +83,11 @@ class MapOutputs:
     """
 
     class_logits: Tensor  # (B, T, things) of the last layer of the location decoder
-    # (L, B, T, 4) of the L location layers: centre x, y and extent x, y of the things, 0 to 1 over the map
-    locations: Tensor
+    locations: Tensor  # (L, B, T, 4) of all location layers: centre x, y and extent x, y, 0 to 1 over the map
     queries: Tensor  # (B, K) int64, the thing query of each selected thing, by falling score
     labels: Tensor  # (B, K) int64, its class, an index into `MapHeadConfig.things`
     scores: Tensor  # (B, K), its class score, 0 to 1
-    # (B, K, Y·X), 0 or larger, without an upper limit; the index of a cell is row * columns + column
-    thing_masks: Tensor
+    thing_masks: Tensor  # (B, K, Y·X), 0 or larger, without an upper limit; cells as in the BEV map
     stuff_masks: Tensor  # (B, S, Y·X), the same for the S stuff classes
 
 
@@ -218,18 +213,18 @@ class MapEncoderLayer(nn.Module):
 
 
 def sine_position(rows: int, columns: int, channels: int) -> Tensor:
-    """(rows · columns, channels) sine position embedding: first that of the row (y), then that of the column (x)."""
-    half = channels // 2
-    y, x = (_sines(cells, half) for cells in (rows, columns))
+    """(rows · columns, channels) sine position embedding: first that of the row (y), then that of the column (x).
+
+    Of each, sine (even channels) and cosine (odd ones) of the cell's centre at falling frequencies.
+    """
+    half, channel = channels // 2, torch.arange(channels // 2)
+    embeddings = []
+    for cells in (rows, columns):
+        centers = (torch.arange(cells, dtype=torch.float32) + 0.5) / (cells + 1e-6) * (2 * math.pi)
+        angles = centers[:, None] / TEMPERATURE ** (2 * (channel // 2) / half)
+        embeddings.append(torch.where(channel % 2 == 0, angles.sin(), angles.cos()))
+    y, x = embeddings
     return torch.cat([y[:, None].expand(-1, columns, -1), x.expand(rows, -1, -1)], dim=-1).flatten(0, 1)
-
-
-def _sines(cells: int, channels: int) -> Tensor:
-    """(cells, channels): sine (even channels) and cosine (odd ones) of a cell's centre at falling frequencies."""
-    centers = (torch.arange(cells, dtype=torch.float32) + 0.5) / (cells + 1e-6) * (2 * math.pi)
-    channel = torch.arange(channels)
-    angles = centers[:, None] / TEMPERATURE ** (2 * (channel // 2) / channels)
-    return torch.where(channel % 2 == 0, angles.sin(), angles.cos())
 
 
 class MaskDecoder(nn.Module):
@@ -299,15 +294,14 @@ class MaskProjection(nn.Module):
         """query: (B, Q, C), cells: (B, Y·X, C) -> masks (B, Q, Y·X), 0 or larger."""
         queries = split_heads(self.query_projection(query), self.heads)
         keys = split_heads(self.key_projection(cells), self.heads).transpose(-1, -2)  # (B, heads, C / heads, Y·X)
-        chunks = (chunk @ keys / math.sqrt(chunk.shape[-1]) for chunk in queries.split(QUERIES_AT_ONCE, dim=2))
-        return torch.cat([self._masks(chunk) for chunk in chunks], dim=1)
-
-    def _masks(self, attention: Tensor) -> Tensor:
-        """attention: (B, heads, q, Y·X) -> (B, q, Y·X)."""
-        for layer in (self.hidden, self.output):
-            attention = torch.einsum("gh,bhqs->bgqs", layer.weight, attention) + layer.bias[:, None, None]
-            attention = attention.relu_()
-        return attention[:, 0]
+        masks = []
+        for chunk in queries.split(QUERIES_AT_ONCE, dim=2):
+            attention = chunk @ keys / math.sqrt(chunk.shape[-1])  # (B, heads, q, Y·X)
+            for layer in (self.hidden, self.output):
+                attention = torch.einsum("gh,bhqs->bgqs", layer.weight, attention) + layer.bias[:, None, None]
+                attention = attention.relu_()
+            masks.append(attention[:, 0])
+        return torch.cat(masks, dim=1)
 
 
 @dataclass(frozen=True)
@@ -315,8 +309,7 @@ class MergedMap:
     """The classes and the instances of every cell of the BEV grid; rows from the smallest y."""
 
     stuff: NDArray[np.bool_]  # (S, rows, columns) bool, in the order of `MapHeadConfig.stuff`
-    # (classes, rows, columns) bool, in the order of `MapHeadConfig.things`; a cell may have several classes
-    things: NDArray[np.bool_]
+    things: NDArray[np.bool_]  # (classes, rows, columns), as `MapHeadConfig.things`; a cell may have several classes
     instances: NDArray[np.int64]  # (rows, columns) int64, the number of a cell's instance from 1, 0 for none
     instance_labels: tuple[int, ...]  # class of each instance, an index into `MapHeadConfig.things`, by falling score
     instance_scores: tuple[float, ...]  # score of each instance, 0 or larger

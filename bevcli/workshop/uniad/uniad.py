@@ -32,17 +32,14 @@ NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego
 class TrackQueryConfig:
     """The life of tracks, and the modules that update their queries."""
 
-    # a query without a track starts one with this score or more; a track's misses are forgotten
-    birth_score: float = 0.4
+    birth_score: float = 0.4  # a query with it or more starts a track; a track's misses are forgotten
     keep_score: float = 0.35  # below this score a track has a miss, and is not given out
     max_misses: int = 5  # the track ends with this miss
     memory_length: int = 4  # number of embeddings that a track remembers
     memory_interval: int = 4  # a track saves its embedding at its first frame and then at every such frame
     attention_heads: int = 8  # of the memory's attention and of the query interaction
-    # boxes whose centre has a larger |x|, |y| or |z| are left out, bev frame
-    center_range_m: tuple[float, float, float] = (61.2, 61.2, 10.0)
-    # height that the box codes state, "center" of the box or its "bottom", as in the released code
-    box_z: Literal["center", "bottom"] = "bottom"
+    center_range_m: tuple[float, float, float] = (61.2, 61.2, 10.0)  # of boxes, |x|, |y|, |z|, bev frame
+    box_z: Literal["center", "bottom"] = "bottom"  # height that the box codes state; "bottom" in the released code
 
     def __post_init__(self) -> None:
         if not 0 <= self.keep_score <= self.birth_score <= 1:
@@ -73,11 +70,6 @@ class Memories:
             torch.ones(count, length, dtype=torch.bool, device=like.device),
             torch.zeros(count, dtype=torch.int64, device=like.device),
         )
-
-    def followed_by(self, others: "Memories") -> "Memories":
-        """These memories, then the others."""
-        columns = zip(vars(self).values(), vars(others).values(), strict=True)
-        return Memories(*map(torch.cat, columns))
 
 
 @dataclass(frozen=True)
@@ -254,8 +246,7 @@ class UniADConfig(ModelConfig):
     has_tracks: ClassVar[bool] = True
 
     ego_motion: EgoMotionConfig = field(default_factory=lambda: EgoMotionConfig(first_frame="original"))
-    # the life of tracks, and the modules that update their queries
-    track_queries: TrackQueryConfig = field(default_factory=TrackQueryConfig)
+    track_queries: TrackQueryConfig = field(default_factory=TrackQueryConfig)  # life of tracks
     map_head: MapHeadConfig = field(default_factory=MapHeadConfig)  # the map head
 
     def __post_init__(self) -> None:
@@ -446,7 +437,8 @@ class UniAD(BEVFormer):
         memories = Memories.empty(embedding[:learned], config.memory_length)
         if before is not None:
             ids, misses = torch.cat([ids, before.ids]), torch.cat([misses, before.misses])
-            memories, next_id = memories.followed_by(before.memories), before.next_id
+            columns = zip(vars(memories).values(), vars(before.memories).values(), strict=True)
+            memories, next_id = Memories(*map(torch.cat, columns)), before.next_id
         ids, misses, next_id = live_and_die(ids, misses, scores, next_id, config)
         alive = ids >= 0
         embedding, position, content = embedding[alive], queries.position[0, alive], queries.content[0, alive]

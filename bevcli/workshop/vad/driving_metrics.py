@@ -31,8 +31,7 @@ NO_MATCH = -100.0
 class LineScores:
     """The scores of map lines."""
 
-    # class -> threshold in metres -> average precision, 0 to 1; 0 for a class without true lines
-    ap: Mapping[str, Mapping[float, float]]
+    ap: Mapping[str, Mapping[float, float]]  # class -> threshold in metres -> AP, 0 to 1; 0 without true lines
     truth_count: Mapping[str, int]  # class -> number of true lines
     frame_count: int  # number of frames
 

@@ -256,7 +256,14 @@ def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.Pl
             left_out += 1
             continue
         times, guessed = plan.times_s, guessed + (not plan.command)
-        frames.append(_planned(plan, world_from_ego @ ego_from_bev, ego_from_bev, later))
+        bev_from_world = inverse(world_from_ego @ ego_from_bev)
+        known = [frame.world_from_ego for frame in later if frame.world_from_ego is not None]
+        origins = [pose.matrix @ ego_from_bev[:, 3] for pose in known]
+        driven = apply(bev_from_world, np.array(origins)[:, :3])[:, :2]
+        command = plan.command or followed(driven, plan.commands)
+        path = apply(bev_from_world, plan.paths[plan.commands.index(command)])[:, :2]
+        boxes = [frame.boxes.transformed(bev_from_world) for frame in later]
+        frames.append(metrics.PlannedFrame(path, driven, boxes))
     if not frames:
         raise InputError(
             f"{file}: `plan` (`--plan`): no frame has a planned path and {max(times, default=3):g} s of ground truth"
@@ -265,17 +272,6 @@ def _plan(file: Path, truth: ScoredInput, pairs: FramePairs) -> tuple[metrics.Pl
     if guessed:
         notes.append(f"{guessed} frames have no command: the path of the command that the driver followed is scored")
     return metrics.evaluate_plans(frames, float(times[0])), tuple(notes)
-
-
-def _planned(
-    plan: Plan, world_from_bev: Array, ego_from_bev: Array, later: Sequence[FrameBoxes]
-) -> metrics.PlannedFrame:
-    bev_from_world = inverse(world_from_bev)
-    origins = [frame.world_from_ego.matrix @ ego_from_bev[:, 3] for frame in later if frame.world_from_ego is not None]
-    driven = apply(bev_from_world, np.array(origins)[:, :3])[:, :2]
-    command = plan.command or followed(driven, plan.commands)
-    path = apply(bev_from_world, plan.paths[plan.commands.index(command)])[:, :2]
-    return metrics.PlannedFrame(path, driven, [frame.boxes.transformed(bev_from_world) for frame in later])
 
 
 def followed(driven: Array, commands: Sequence[str]) -> str:

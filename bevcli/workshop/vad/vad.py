@@ -135,8 +135,7 @@ class MotionConfig:
     feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward networks
     dropout: float = 0.1  # probability, 0 to below 1
     min_line_score: float = 0.5  # objects attend to lines with a higher score
-    # objects attend to lines up to this distance, in shares of the range of the BEV grid
-    max_line_distance: float = 0.2
+    max_line_distance: float = 0.2  # objects attend to lines up to it, in shares of the range of the BEV grid
 
     def __post_init__(self) -> None:
         counts = (self.modes, self.steps, self.attention_heads, self.feed_forward_width)
@@ -487,9 +486,10 @@ class VAD(BEVFormer):
 
     def decode(self, outputs: ModelOutputs) -> Iterator[Boxes3D | BevMap | FrameResult]:
         assert isinstance(outputs, VADOutputs)
-        yield decode_futures(outputs, self.config)
-        yield decode_lines(outputs, self.config)
-        yield decode_plan(outputs, self.config)
+        config = self.config
+        yield decode_futures(outputs, config)
+        yield decode_lines(outputs, config)
+        yield Plan(config.commands, _array(outputs.plan[0]).cumsum(1), np.array(config.future_times_s))
 
 
 def decode_futures(outputs: VADOutputs, config: VADConfig) -> Boxes3D:
@@ -512,11 +512,5 @@ def decode_lines(outputs: VADOutputs, config: VADConfig) -> MapLines:
     return MapLines(tuple(points), np.asarray(decoder.classes)[labels.cpu().numpy()], _array(scores))
 
 
-def decode_plan(outputs: VADOutputs, config: VADConfig) -> Plan:
-    """The planned paths, bev frame."""
-    return Plan(config.commands, _array(outputs.plan[0]).cumsum(1), np.array(config.future_times_s))
-
-
 def _array(values: Tensor) -> Array:
-    array: Array = values.double().cpu().numpy()
-    return array
+    return np.asarray(values.double().cpu())

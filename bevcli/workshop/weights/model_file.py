@@ -1,5 +1,6 @@
 """The model file of weights that fit a known model but for its classes."""
 
+import contextlib
 import json
 import math
 from collections import Counter
@@ -9,7 +10,7 @@ from typing import Any
 
 import torch
 
-from bevcli.checkpoints import Checkpoint, difference, expected_state, read_checkpoint
+from bevcli.checkpoints import difference, expected_state, read_checkpoint
 from bevcli.config import as_toml, config_of_table, load_config, read_model_file
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.config import ModelConfig
@@ -47,7 +48,10 @@ def model_file_for(
             f"{path}: already exists; choose another name, or pass `force=True` (`--force`) to overwrite it"
         )
     model = checkpoint.nearest
-    names = file_options.classes or _stated(checkpoint)
+    names = file_options.classes
+    with contextlib.suppress(ValueError):  # else as the metadata of the weights name them
+        stated = json.loads(checkpoint.facts.get("classes", "[]"))
+        names = names or (tuple(map(str, stated)) if isinstance(stated, list) else ())
     model_config = load_config(model)
     count = len(model_config.classes) if checkpoint.models else checkpoint.own_classes
     if count is None:
@@ -68,15 +72,6 @@ def model_file_for(
     return config, model
 
 
-def _stated(checkpoint: Checkpoint) -> tuple[str, ...]:
-    """The classes that the metadata of weights name; else none."""
-    try:
-        classes = json.loads(checkpoint.facts.get("classes", "[]"))
-    except ValueError:
-        return ()
-    return tuple(map(str, classes)) if isinstance(classes, list) else ()
-
-
 Shape = tuple[int, ...]
 
 
@@ -86,8 +81,7 @@ class ModelPart:
 
     name: str  # in the paper's terms
     modules: tuple[str, ...]  # beginnings of the part's keys in the state dict
-    # shapes of the weights with two or more axes, in the order of the state dict; biases and norms left out
-    shapes: tuple[Shape, ...]
+    shapes: tuple[Shape, ...]  # of weights with two or more axes, as in the state dict; without biases and norms
     parameters: int  # number of learned values, biases and norms included
 
 
