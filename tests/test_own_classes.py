@@ -16,7 +16,7 @@ from bevcli.inference.tracking import TrackerConfig
 from bevcli.recording.entities import class_colors
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.workshop.formats.kitti import kitti_labels
-from bevcli.workshop.scores.config import DetectionConfig
+from bevcli.workshop.scores.detection import DetectionConfig
 from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.scores.tracking import TrackingConfig
 

@@ -1,6 +1,7 @@
 """`Session`: predictions for frames from memory, such as those of a vehicle or a simulator."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from operator import index
 from threading import Lock
@@ -16,10 +17,7 @@ from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.inference import StepOptions
 from bevcli.inference.load import Model
-from bevcli.inference.preprocess import (
-    check_cameras,
-    checked_images,
-)
+from bevcli.inference.preprocess import check_cameras, checked_images
 from bevcli.inference.runner import RunnerState, one_command
 from bevcli.options import refuse, spread
 from bevcli.workshop.odometry.measure import LiveMotion, RecentPoses
@@ -134,51 +132,42 @@ class Session:
         poses for some frames only, a time that is not later than the one before, and a call while another thread is in
         a step. The session is then as it was before the call.
         """
+        with self._alone():
+            stamp = self._next_stamp(timestamp_ns)
+            self._check_all_or_none(world_from_ego is None, world_from_ego_at)
+            pose = Pose.identity() if world_from_ego is None else _pose(world_from_ego, "`world_from_ego`")
+            poses = self._poses.with_pose(stamp.timestamp_ns, pose)
+            given = (world_from_ego_at or {}).items()
+            at = {name: _pose(pose_then, f"`world_from_ego_at`: camera {name}") for name, pose_then in given}
+            check_cameras(at, self.rig, "world_from_ego_at")
+            frame = Frame(
+                stamp=stamp,
+                rig=self.rig,
+                images=checked_images(images, self.rig, self._color_order, stamp.timestamp_ns),
+                world_from_ego=pose,
+                world_from_ego_at=dict.fromkeys(self.rig.names, pose) | at,
+                kinematics=poses.kinematics() if kinematics is None else kinematics,
+                dropped={name: "not given" for name in self.rig.names if name not in images},
+            )
+            if command is not None:
+                self._runner.commands = one_command(command, self._runner.config)
+            if world_from_ego is None:
+                frame = self._measured(frame, kinematics)
+            self._state, prediction = self._runner.step(self._state, self._runner.prepare(frame))
+            self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
+            return prediction
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
         if not self._stepping.acquire(blocking=False):
             raise InputError(
                 "another thread is in a step of this session: call `step` from one thread, or make a session for each "
                 "vehicle"
             )
         try:
-            return self._step(images, world_from_ego, timestamp_ns, world_from_ego_at, kinematics, command)
+            yield
         finally:
             self._stepping.release()
-
-    def _step(
-        self,
-        images: Mapping[str, NDArray[Any]],
-        world_from_ego: Pose | ArrayLike | None,
-        timestamp_ns: int,
-        world_from_ego_at: Mapping[str, Pose | ArrayLike] | None,
-        kinematics: Kinematics | None,
-        command: str | None,
-    ) -> Prediction:
-        stamp = self._next_stamp(timestamp_ns)
-        self._check_all_or_none(world_from_ego is None, world_from_ego_at)
-        pose = Pose.identity() if world_from_ego is None else _pose(world_from_ego, "`world_from_ego`")
-        poses = self._poses.with_pose(stamp.timestamp_ns, pose)
-        known_poses = (world_from_ego_at or {}).items()
-        at = {
-            name: _pose(world_from_ego_then, f"`world_from_ego_at`: camera {name}")
-            for name, world_from_ego_then in known_poses
-        }
-        check_cameras(at, self.rig, "world_from_ego_at")
-        frame = Frame(
-            stamp=stamp,
-            rig=self.rig,
-            images=checked_images(images, self.rig, self._color_order, stamp.timestamp_ns),
-            world_from_ego=pose,
-            world_from_ego_at=dict.fromkeys(self.rig.names, pose) | at,
-            kinematics=poses.kinematics() if kinematics is None else kinematics,
-            dropped={name: "not given" for name in self.rig.names if name not in images},
-        )
-        if command is not None:
-            self._runner.commands = one_command(command, self._runner.config)
-        if world_from_ego is None:
-            frame = self._measured(frame, kinematics)
-        self._state, prediction = self._runner.step(self._state, self._runner.prepare(frame))
-        self.frame, self._poses, self._last_ns = frame, poses, stamp.timestamp_ns
-        return prediction
 
     def reset(self) -> None:
         """Forget the history: the next frame begins a new drive, at any time and place. Its number goes on."""

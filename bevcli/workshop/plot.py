@@ -16,26 +16,8 @@ from bevcli.recording.log_boxes import MOVING_M_S, box_colors, image_box_colors
 from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
 from bevcli.recording.log_static import bev_image_points, range_lines
 from bevcli.recording.meshes import default_vehicle
-from bevcli.viewer.drawing import (
-    BACKGROUND,
-    BEV_MARGIN,
-    CAMERAS_HEIGHT,
-    CAMERAS_WIDTH,
-    LABEL_SHARE,
-    SMALL_TEXT,
-    TEXT,
-    UNTRAINED,
-    WARNING,
-    Canvas,
-    draw_arrow,
-    draw_entry,
-    draw_lines,
-    draw_text,
-    draw_title,
-    from_above,
-    new_sheet,
-    tiles_of,
-)  # fmt: skip
+from bevcli.viewer import drawing
+from bevcli.viewer.drawing import Canvas
 
 TOP = (4, 5, 6, 7, 4)  # corners of a box, around its top
 
@@ -58,14 +40,14 @@ def plot(prediction: Prediction, image: str | None, score: float, color_order: C
 
 
 def _whole(prediction: Prediction, frame: Frame, boxes: Boxes3D, colors: dict[str, Color], score: float) -> Canvas:
-    canvas = new_sheet()
+    canvas = drawing.new_sheet()
     sizes = {camera.name: (camera.width, camera.height) for camera in frame.rig.cameras}
-    for tile in tiles_of(sizes, {camera.name: camera.yaw for camera in frame.rig.cameras}):
+    for tile in drawing.tiles_of(sizes, {camera.name: camera.yaw for camera in frame.rig.cameras}):
         camera = frame.rig[tile.camera]
         drawn = _camera_image(prediction, frame, boxes, colors, score, camera, tile.width, tile.height)
         canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width] = drawn
-    _draw_from_above(canvas[:, CAMERAS_WIDTH:], prediction, frame, boxes, colors)
-    _draw_legend(canvas[CAMERAS_HEIGHT:, :CAMERAS_WIDTH], prediction, boxes, colors)
+    _draw_from_above(canvas[:, drawing.CAMERAS_WIDTH :], prediction, frame, boxes, colors)
+    _draw_legend(canvas[drawing.CAMERAS_HEIGHT :, : drawing.CAMERAS_WIDTH], prediction, boxes, colors)
     return canvas
 
 
@@ -83,8 +65,8 @@ def _camera_image(
     scaled = camera.scaled(width / camera.width, height / camera.height)
     image = frame.images.get(camera.name)
     if image is None:
-        canvas = np.full((height, width, 3), BACKGROUND, dtype=np.uint8)
-        draw_title(canvas, camera.name, has_image=False)
+        canvas = np.full((height, width, 3), drawing.BACKGROUND, dtype=np.uint8)
+        drawing.draw_title(canvas, camera.name, has_image=False)
         return canvas
     canvas = cv2.resize(image.pixels_bgr, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
     world_from_camera = frame.world_from_ego_at[camera.name].matrix @ camera.ego_from_camera
@@ -96,15 +78,15 @@ def _camera_image(
         in_image = prediction.image_boxes[camera.name].scored(score)
         shades = image_box_colors(prediction, frame, {camera.name: in_image}, score, colors)[camera.name]
         for outline, color in zip(in_image.outlines(), shades, strict=True):
-            draw_lines(canvas, [outline * (width / camera.width, height / camera.height)], _bgr(color))
+            drawing.draw_lines(canvas, [outline * (width / camera.width, height / camera.height)], _bgr(color))
     for box in np.unique(lines.owners):
-        draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)
-    size = max(SMALL_TEXT, width * LABEL_SHARE)
+        drawing.draw_lines(canvas, lines.segments[lines.owners == box], _bgr(own_colors[box]), 1 + width // 800)
+    size = max(drawing.SMALL_TEXT, width * drawing.LABEL_SHARE)
     for (x, y), box in zip(*labels_in_image(lines, texts, width, height), strict=True):
-        draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own_colors[box]), size, centered=True)
-    draw_title(canvas, camera.name, has_image=True)
+        drawing.draw_text(canvas, texts[box], (int(x), max(int(y), 10)), _bgr(own_colors[box]), size, centered=True)
+    drawing.draw_title(canvas, camera.name, has_image=True)
     if prediction.untrained:
-        draw_text(canvas, UNTRAINED, (width // 2, height - 14), WARNING, 0.42, centered=True)
+        drawing.draw_text(canvas, drawing.UNTRAINED, (width // 2, height - 14), drawing.WARNING, 0.42, centered=True)
     return canvas
 
 
@@ -113,7 +95,7 @@ def _draw_from_above(
 ) -> None:
     """The map, range rings, boxes with their velocities, and the vehicle, in the bev frame."""
     grid, rings = prediction.grid, range_lines(frame.rig, prediction.grid)
-    to_canvas = from_above(BEV_MARGIN * max(np.abs([*grid.x_range_m, *grid.y_range_m])))
+    to_canvas = drawing.from_above(drawing.BEV_MARGIN * max(np.abs([*grid.x_range_m, *grid.y_range_m])))
 
     if prediction.segmentation is not None:
         (left, right), (low, high) = prediction.segmentation.x_range_m, prediction.segmentation.y_range_m
@@ -122,30 +104,30 @@ def _draw_from_above(
         area = prediction.segmentation.painted(palette, entities.BACKGROUND)[..., ::-1]
         canvas[y0:y1, x0:x1] = cv2.resize(area, (x1 - x0, y1 - y0), interpolation=cv2.INTER_NEAREST)
     for ring in rings:
-        draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, ring))], _bgr(RING_COLOR))
+        drawing.draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, ring))], _bgr(RING_COLOR))
     corners, own_colors = boxes.corners()[..., :2] * (1, -1), box_colors(boxes, colors)
     for index in reversed(range(len(boxes))):  # the best ones lie on top
-        draw_lines(canvas, to_canvas(corners[index][[TOP]]), _bgr(own_colors[index]), 2)
+        drawing.draw_lines(canvas, to_canvas(corners[index][[TOP]]), _bgr(own_colors[index]), 2)
         velocity = boxes.velocities[index] * (1, -1)
         if np.linalg.norm(velocity) > MOVING_M_S:  # not of NaN
             start = boxes.centers[index, :2] * (1, -1)
             tail, tip = to_canvas(np.stack([start, start + velocity]))
-            draw_arrow(canvas, tail, tip, _bgr(own_colors[index]))
+            drawing.draw_arrow(canvas, tail, tip, _bgr(own_colors[index]))
     for strip in default_vehicle().top_view:
-        draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, strip))], _bgr(EGO_COLOR), 2)
+        drawing.draw_lines(canvas, [to_canvas(bev_image_points(frame.rig, strip))], _bgr(EGO_COLOR), 2)
 
 
 def _draw_legend(canvas: Canvas, prediction: Prediction, boxes: Boxes3D, colors: dict[str, Color]) -> None:
     scene = f"{prediction.stamp.scene}   " if prediction.stamp.scene else ""
-    draw_text(canvas, f"{scene}frame {prediction.stamp.index}", (16, 24), TEXT, 0.6)
-    draw_text(canvas, prediction.failure, (250, 24), WARNING, 0.45)
+    drawing.draw_text(canvas, f"{scene}frame {prediction.stamp.index}", (16, 24), drawing.TEXT, 0.6)
+    drawing.draw_text(canvas, prediction.failure, (250, 24), drawing.WARNING, 0.45)
     counts = boxes.classes.tolist()
     entries = [(color, f"{name.replace('_', ' ')} {counts.count(name)}") for name, color in colors.items()]
     if prediction.segmentation is not None:
         maps = map_colors(prediction.segmentation.classes).items()
         entries += [(color, f"map: {name.replace('_', ' ')}") for name, color in maps]
     for index, (color, text) in enumerate(entries[:15]):
-        draw_entry(canvas, (16 + 250 * (index % 5), 60 + 32 * (index // 5)), color, text)
+        drawing.draw_entry(canvas, (16 + 250 * (index % 5), 60 + 32 * (index // 5)), color, text)
 
 
 def _bgr(color: Color | NDArray[np.uint8]) -> Color:

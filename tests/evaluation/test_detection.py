@@ -17,8 +17,7 @@ from random_boxes import as_predictions, random_truth
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.matching import descending_scores, match_greedily
 from bevcli.geometry.transforms import rigid, rotation_about_z
-from bevcli.workshop.scores.config import DetectionConfig
-from bevcli.workshop.scores.detection import DetectionScores, evaluate_detections, gather
+from bevcli.workshop.scores.detection import DetectionConfig, DetectionScores, evaluate_detections, gather
 from bevcli.workshop.scores.evaluate import evaluate
 
 

@@ -15,8 +15,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.runs.state import load_state, save_state
 from bevcli.sequences.files.map_folder import open_maps, write_map
 from bevcli.workshop.batch.report import DriveMatches, score_jointly
-from bevcli.workshop.scores.config import DetectionConfig
-from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.detection import DetectionConfig, evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, evaluate_segmentation
 
 MAP = BevMap(np.arange(12, dtype=np.uint8).reshape(3, 4), (-32.0, 32.0), (-24.0, 24.0))

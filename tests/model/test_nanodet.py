@@ -18,7 +18,7 @@ from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.workshop.training.clip_steps import FrozenStages
+from bevcli.workshop.training.trainer import FrozenStages
 
 # Output and input channels and kernel size of the 34 convolutions of NanoDet-g for COCO, in the order of the graph.
 SIZES = [

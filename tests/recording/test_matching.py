@@ -9,8 +9,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording.entities import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
 from bevcli.recording.log_boxes import detectable, ground_truth_colors, other_classes, true_positives
-from bevcli.workshop.scores.config import DetectionConfig
-from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.detection import DetectionConfig, evaluate_detections
 
 
 def boxes(places, classes, scores=None) -> Boxes3D:

@@ -16,10 +16,10 @@ from bevcli.model.temporal_model import build_model
 from bevcli.workshop.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.training import TrainOptions
-from bevcli.workshop.training.clip_steps import FrozenStages, forward_clip
 from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
 from bevcli.workshop.training.job import ProcessGroup, TrainingConfig, prepare_training
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig
+from bevcli.workshop.training.trainer import FrozenStages, forward_clip
 
 V1 = replace(CONFIG, heads=("detection",))
 WINDOW = BEVFormerV2Config(

@@ -15,10 +15,10 @@ from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import build_network
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
-from bevcli.workshop.training.clip_steps import DistillationLossConfig, Teacher, forward_clip
+from bevcli.workshop.training.frame_losses import DistillationLossConfig, Teacher
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob
 from bevcli.workshop.training.samples import Batch, Clip, ClipConfig
-from bevcli.workshop.training.trainer import Trainer, save_weights
+from bevcli.workshop.training.trainer import Trainer, forward_clip, save_weights
 
 NOISE = AugmentationConfig(photometric=0, grid_mask=0, noise=60.0)
 PLAIN = AugmentationConfig(photometric=0, grid_mask=0)

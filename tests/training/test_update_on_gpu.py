@@ -11,8 +11,7 @@ from simulated_device import provide_training, simulated
 
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
-from bevcli.workshop.training.clip_steps import DistillationLossConfig
-from bevcli.workshop.training.frame_losses import PerspectiveLossConfig
+from bevcli.workshop.training.frame_losses import DistillationLossConfig, PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob
 from bevcli.workshop.training.losses import DenseLossConfig
 from bevcli.workshop.training.samples import ClipConfig

@@ -28,8 +28,7 @@ from bevcli.printing import cell_of, counted, duration
 from bevcli.runs.state import load_state
 from bevcli.workshop.batch.job import Record
 from bevcli.workshop.batch.storage import READING_THREADS, RESULTS, Storage
-from bevcli.workshop.scores.config import ERRORS, DetectionConfig
-from bevcli.workshop.scores.detection import ClassMatches, DetectionScores, with_all_columns
+from bevcli.workshop.scores.detection import ERRORS, ClassMatches, DetectionConfig, DetectionScores, with_all_columns
 from bevcli.workshop.scores.evaluate import OWN_CLASSES, FrameScores, SegmentationScores
 
 MATCHES = "matches.pt"  # in the folder of a drive's results: for the joint metrics

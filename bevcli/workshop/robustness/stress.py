@@ -25,8 +25,7 @@ from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration.calibrate import calibrate
 from bevcli.workshop.robustness import StressOptions
 from bevcli.workshop.robustness.conditions import CLEAN, CORRUPTIONS, Condition, Corruption, Group, choose_conditions
-from bevcli.workshop.scores.config import DetectionConfig
-from bevcli.workshop.scores.detection import evaluate_detections, known_mean
+from bevcli.workshop.scores.detection import DetectionConfig, evaluate_detections, known_mean
 from bevcli.workshop.scores.evaluate import boxes_ego, finite
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FrameMemory, KeptFrames, RenderedDrives

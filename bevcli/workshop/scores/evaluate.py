@@ -20,8 +20,7 @@ from bevcli.printing import counted, number
 from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.scores import ResultOptions, inputs
-from bevcli.workshop.scores.config import ERRORS, DetectionConfig
-from bevcli.workshop.scores.detection import DetectionScores, ScoreTable, evaluate_detections
+from bevcli.workshop.scores.detection import ERRORS, DetectionConfig, DetectionScores, ScoreTable, evaluate_detections
 from bevcli.workshop.scores.plots import write_plots
 from bevcli.workshop.scores.tables import Cell, Table
 from bevcli.workshop.scores.tracking import TrackingScores, score_tracks

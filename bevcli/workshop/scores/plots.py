@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from bevcli.geometry.matching import ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted
-from bevcli.workshop.scores.config import ERRORS
-from bevcli.workshop.scores.detection import RECALLS, ClassScores, DetectionScores, ScoreTable
+from bevcli.workshop.scores.detection import ERRORS, RECALLS, ClassScores, DetectionScores, ScoreTable
 from bevcli.workshop.scores.inputs import FramePairs
 from bevcli.workshop.scores.worst_frames import MODELS, Outcome, best_outcome
 from bevcli.writing import whole_file

@@ -15,7 +15,7 @@ from bevcli.recording.log_static import RecordedBoxes
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import count_labels, open_sequence
-from bevcli.workshop.scores.config import ranges_m
+from bevcli.workshop.scores.detection import ranges_m
 from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
 
 MOST = 2  # models: each has a colour

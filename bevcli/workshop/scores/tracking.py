@@ -18,8 +18,7 @@ from bevcli.geometry.matching import MATCH_DISTANCE_M
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import number
-from bevcli.workshop.scores.config import ClassRanges, ranges_m
-from bevcli.workshop.scores.detection import gather
+from bevcli.workshop.scores.detection import ClassRanges, gather, ranges_m
 from bevcli.workshop.scores.inputs import Compared
 from bevcli.workshop.scores.tables import Cell, Table
 

@@ -297,6 +297,33 @@ def signal_head(lit: str) -> list[mesh.Mesh]:
     return parts
 
 
+def any_color(rng: np.random.Generator) -> NDArray[np.float32]:
+    """(3,) linear RGB of any brightness; greys are frequent."""
+    grey = rng.random() ** 2
+    color = grey + (rng.random(3) - grey) * rng.random()
+    return np.asarray(0.02 + 0.9 * color, np.float32)
+
+
+def nameless(rng: np.random.Generator) -> mesh.Mesh:
+    """One to four blocks, balls, cones and poles on top of each other or side by side, 0.3 to 5 m."""
+    parts = []
+    for _ in range(int(rng.integers(1, 5))):
+        length, width, height = np.exp(rng.uniform(np.log(0.2), np.log((3.0, 1.2, 3.0))))
+        x, y, low = *rng.uniform(-0.5, 0.5, 2), float(rng.uniform(0, 1)) * (rng.random() < 0.4)
+        red, green, blue = (int(255 * c) for c in any_color(rng) ** 0.45)
+        color: mesh.Color = (red, green, blue)
+        kind = rng.integers(4)
+        if kind == 0:
+            parts.append(mesh.block((x, y, low + height / 2), (length, width, height), color))
+        elif kind == 1:
+            parts.append(mesh.ball((x, y, low + height / 2), (length / 2, width / 2, height / 2), color))
+        elif kind == 2:
+            parts.append(mesh.cone(low, low + height, width / 2, width / 2 * float(rng.random()) + 0.01, color))
+        else:
+            parts.append(mesh.rod((x, y, 0), (x + rng.uniform(-1, 1), y, height + 1), 0.03 + 0.1 * rng.random(), color))
+    return mesh.joined(parts)
+
+
 # Colours to draw from.
 CAR_PAINTS: Colors = (
     (235, 236, 238), (196, 199, 203), (120, 124, 130), (62, 66, 72), (26, 28, 32), (170, 28, 30), (120, 22, 30),

@@ -346,7 +346,10 @@ def build_route(
         across = city.street_at(node, after + 1)
         leave = _lane_point(center, after, new_offset, across.half_width + CROSSING_M[1])
         marks.append((node, direction, turn, stop, leave))
-        piece = _arc(begin, corner, end) if turn != 0 else np.stack([begin, end])
+        piece = np.stack([begin, end])
+        if turn != 0:  # a quarter of an ellipse, tangent to both lines
+            middle, angle = begin + end - corner, np.linspace(0, np.pi / 2, 17)[:, None]
+            piece = middle + (begin - middle) * np.cos(angle) + (end - middle) * np.sin(angle)
         corners.append(piece)
         travelled += float(np.linalg.norm(piece[0] - at)) + radius * 1.6
         at, node, direction, offset = piece[-1], following, after, new_offset
@@ -357,13 +360,6 @@ def build_route(
 def _lane_point(center: Array, direction: int, offset: float, ahead: float) -> Array:
     """Plan point on a lane at a junction: `offset` metres right of its centre and `ahead` metres behind it."""
     return center + right_of(direction) * offset + DIRECTIONS[direction] * ahead
-
-
-def _arc(begin: Array, corner: Array, end: Array) -> Array:
-    """(17, 2) quarter of an ellipse from begin to end, tangent to the lines from begin and end to the corner."""
-    center = begin + end - corner
-    angle = np.linspace(0, np.pi / 2, 17)[:, None]
-    return center + (begin - center) * np.cos(angle) + (end - center) * np.sin(angle)
 
 
 def _finish(city: CityPlan, corners: Array, marks: list, speed: float) -> Route:

@@ -317,6 +317,8 @@ class RenderedDrive:
 EGO_MOTION_HZ = 50.0
 SUPERSAMPLED_WIDTH = 1000  # images up to this width are supersampled by default
 THREADS = 2
+# Of the boxes that are written, in m, radians, m/s: they keep the files small.
+DECIMALS = {"centers": 4, "sizes_lwh": 4, "yaws": 5, "velocities": 4, "visibilities": 4}
 
 
 @dataclass(frozen=True)
@@ -383,19 +385,14 @@ def export_frames(
             for name, pixels in rendered.images.items():
                 encoded = encode_image(pixels, quality=quality)
                 images[name] = CameraImage(rendered.camera_timestamps_ns[name], pixels, encoded, "image/jpeg")
+            values: dict[str, Any] = {name: getattr(rendered.boxes, name) for name in DECIMALS}
+            rounded = {name: np.round(v, DECIMALS[name]) for name, v in values.items() if v is not None}
             frame = Frame(
                 rendered.stamp, drive.rig, images, rendered.world_from_ego, rendered.world_from_ego_at,
-                motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=_rounded(rendered.boxes),
+                motion.kinematics_at(rendered.stamp.timestamp_ns), ground_truth=replace(rendered.boxes, **rounded),
                 ground_truth_map=rendered.bev_map, ground_truth_results=(rendered.lines,),
             )  # fmt: skip
             writer.write(frame)
             yield frame
     # The writer has written a pose for each frame. Replace them by denser ones, so that cameras may have time offsets.
     write_ego_motion(folder / "ego_motion.csv", motion)
-
-
-def _rounded(boxes: Boxes3D) -> Boxes3D:
-    """The boxes rounded to 0.1 mm and 10 microradians, which keeps the files small."""
-    decimals = {"centers": 4, "sizes_lwh": 4, "yaws": 5, "velocities": 4, "visibilities": 4}
-    values: dict[str, Any] = {name: getattr(boxes, name) for name in decimals}
-    return replace(boxes, **{name: np.round(v, decimals[name]) for name, v in values.items() if v is not None})

@@ -19,7 +19,7 @@ from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, Frame
 from bevcli.geometry.cameras import CameraRig
 from bevcli.inference.preprocess import image_for_rig, network_scale, rig_enlargement
-from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.config import ModelConfig
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import read_text
 from bevcli.sequences.open import open_sequence, open_steps
@@ -123,14 +123,22 @@ class RenderedDrives(FolderDrives):
         if isinstance(rig, RigDistribution):
             if rig.material:
                 MaterialFolder.read(rig.material)  # a wrong file is an error before the training begins
-            self._rigs = [_enlarged(draw_rig(rig, seed, image.size), image) for seed in seeds]
+            self._rigs = []
+            for drawn in (draw_rig(rig, seed, image.size) for seed in seeds):
+                factor = rig_enlargement(drawn.rig, image)  # images as much larger as the network sees them
+                cameras = tuple(camera.scaled(factor) for camera in drawn.rig.cameras)
+                self._rigs.append(replace(drawn, rig=replace(drawn.rig, cameras=cameras)))
             sizes = [image_for_rig(drawn.rig, image).padded_size for drawn in self._rigs]
             counts = [len(drawn.rig.cameras) for drawn in self._rigs]
             self.input_shapes = tuple((count, h, w) for count, (w, h) in zip(counts, sizes, strict=True))
             name += f"-rigs-{rig.digest}"
             name += "" if image.focal_px is None else f"-{image.focal_px:g}px-{image.max_pixels}"
         else:
-            fitting = nuscenes_like_rig(width, height) if rig is None else _fitting(rig, image)
+            fitting = nuscenes_like_rig(width, height)
+            if rig is not None:  # each camera's images in the size in which the network sees them
+                sized = image_for_rig(rig, image)
+                cameras = tuple(camera.scaled(network_scale(camera, sized)) for camera in rig.cameras)
+                fitting = replace(rig, cameras=cameras)
             self._rigs = [DrawnRig(fitting)] * len(seeds)
             name += "" if rig is None else f"-rig-{_digest(fitting)}"
         super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
@@ -172,19 +180,6 @@ class RenderedDrives(FolderDrives):
             shutil.rmtree(unfinished)  # another process has rendered the same drive meanwhile
 
 
-def _fitting(rig: CameraRig, image: ImageConfig) -> CameraRig:
-    """The rig with each camera's images in the size in which the network sees them."""
-    sized = image_for_rig(rig, image)
-    return replace(rig, cameras=tuple(camera.scaled(network_scale(camera, sized)) for camera in rig.cameras))
-
-
-def _enlarged(drawn: DrawnRig, image: ImageConfig) -> DrawnRig:
-    """A rig drawn for images of `image.size`, with images as much larger as the network sees them."""
-    factor = rig_enlargement(drawn.rig, image)
-    cameras = tuple(camera.scaled(factor) for camera in drawn.rig.cameras)
-    return replace(drawn, rig=replace(drawn.rig, cameras=cameras))
-
-
 def _digest(rig: CameraRig) -> str:
     """Eight hexadecimal digits that differ between rigs."""
     parts = [
@@ -199,15 +194,15 @@ def count_frames(drives: Drives) -> int:
     return sum(len(drives.open(index).stamps) for index in range(len(drives)))
 
 
-KEYS = ("train", "validate")
-
-
 @dataclass(frozen=True)
 class Split:
     """The sequence folders of a split file: to train on, and to score on."""
 
     train: tuple[Path, ...]
     validate: tuple[Path, ...]
+
+
+KEYS = ("train", "validate")
 
 
 def read_split(path: Path) -> Split:

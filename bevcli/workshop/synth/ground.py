@@ -145,8 +145,13 @@ class GroundPlan:
         for sign, stop in ((1, low), (-1, high)):
             side = _approach_side(street, sign)
             for lane in range(street.lanes):
-                for back in (5.0, 17.0):
-                    yield from self._arrow(street, stop + sign * back, side * street.lane_offset(lane), sign)
+                offset = side * street.lane_offset(lane)
+                for at in (stop + sign * 5.0, stop + sign * 17.0):
+                    yield from self._bars(
+                        [street.point(at, offset)], [street.point(at + sign * 2.2, offset)], 0.16, WHITE
+                    )
+                    tip, sides = street.point(at - sign * 1.1, offset), (offset + 0.42, offset - 0.42)
+                    yield GroundPaint(self.city.bend([tip, *(street.point(at, side) for side in sides)]), WHITE)
         for _ in range(rng.poisson(5)):
             at, offset = rng.uniform(low, high), rng.uniform(-1, 1) * (street.half_width - 1.5)
             size = rng.uniform(0.5, 3.5), rng.uniform(0.3, 1.2)
@@ -157,11 +162,6 @@ class GroundPlan:
             angle = np.linspace(0, 2 * np.pi, 14)[:-1]
             cover = np.array(street.point(at, offset)) + 0.36 * np.stack([np.cos(angle), np.sin(angle)], -1)
             yield GroundPaint(self.city.bend(cover), (58, 56, 55))
-
-    def _arrow(self, street: Street, at: float, offset: float, sign: int) -> Iterator[GroundPaint]:
-        yield from self._bars([street.point(at, offset)], [street.point(at + sign * 2.2, offset)], 0.16, WHITE)
-        head = [street.point(at - sign * 1.1, offset), street.point(at, offset + 0.42), street.point(at, offset - 0.42)]
-        yield GroundPaint(self.city.bend(head), WHITE)
 
     def _line(self, street: Street, start: float, end: float, offset: float) -> Array:
         return along(street.point(start, offset), street.point(end, offset))

@@ -296,7 +296,8 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
     low, high = distribution.fov_deg
     fov_deg = random.uniform(min(max(low, spacing_deg), high), high)
     height, radius = random.uniform(*distribution.height_m), random.uniform(*distribution.radius_m)
-    coefficients = _lens(distribution, random)
+    coefficients = random.uniform(-1, 1, 4) * (0.12, 0.02, 0.002, 0.002) + (-0.12, 0.03, 0, 0)  # k1, k2, p1, p2
+    is_distorted = random.random() < distribution.distorted_share
     width_px = min(size[0], size[1] * aspect) * coarse
     image_size = max(round(width_px), 16), max(round(width_px / aspect), 16)
     cameras = []
@@ -309,9 +310,13 @@ def _random_rig(distribution: RigDistribution, size: tuple[int, int], coarse: fl
         position = (x, y, np.clip(height + random.uniform(-0.15, 0.15), *distribution.height_m))
         tilt = _tilt(distribution.tilt_deg, random)
         rotation = rotation_about_z(np.radians(yaw_deg)) @ tilt @ EGO_AXES_FROM_CAMERA
-        distortion = None if coefficients is None else _fitting(coefficients, intrinsics, image_size)
+        distortion = _fitting(coefficients, intrinsics, image_size) if is_distorted else None
         cameras.append(Camera(f"CAM_{index}", *image_size, intrinsics, rigid(position, rotation), distortion))
-    return CameraRig(tuple(cameras), _ego_from_bev(distribution, random))
+    tilt = _tilt(distribution.bev_tilt_deg, random)
+    # Of the bev frame: near the middle of the vehicle, x to the right.
+    origin = (random.uniform(0.5, 1.5), random.uniform(-0.1, 0.1), random.uniform(*distribution.bev_height_m))
+    heading = rotation_about_z(-np.pi / 2 + np.radians(random.uniform(-1, 1)))
+    return CameraRig(tuple(cameras), rigid(origin, tilt @ heading))
 
 
 def _yaws_deg(
@@ -335,13 +340,7 @@ def _intrinsics(size: tuple[int, int], fov_deg: float, distribution: RigDistribu
     return np.array([[focal, 0, x * width], [0, focal * ratio, y * height], [0, 0, 1.0]])
 
 
-def _lens(distribution: RigDistribution, random: Generator) -> tuple[float, ...] | None:
-    """Coefficients k1, k2, p1, p2 of all lenses of a rig; None for no distortion."""
-    drawn = random.uniform(-1, 1, 4) * (0.12, 0.02, 0.002, 0.002) + (-0.12, 0.03, 0, 0)
-    return tuple(float(k) for k in drawn) if random.random() < distribution.distorted_share else None
-
-
-def _fitting(coefficients: tuple[float, ...], intrinsics: Array, size: tuple[int, int]) -> Distortion:
+def _fitting(coefficients: Array, intrinsics: Array, size: tuple[int, int]) -> Distortion:
     """The distortion, weaker for wide lenses: as at a field of view of 70 degrees in the corner of the image."""
     corner = np.hypot(size[0] / intrinsics[0, 0], size[1] / intrinsics[1, 1]) / 2
     weaker = min(1.0, (0.7 / corner) ** 2)
@@ -359,11 +358,3 @@ def tilt(pitch: float, roll: float) -> Array:
     about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return np.asarray(about_y @ about_x)
-
-
-def _ego_from_bev(distribution: RigDistribution, random: Generator) -> Array:
-    """(4, 4): x right, y forward, tilted, at a random height near the middle of the vehicle."""
-    tilt = _tilt(distribution.bev_tilt_deg, random)
-    origin = (random.uniform(0.5, 1.5), random.uniform(-0.1, 0.1), random.uniform(*distribution.bev_height_m))
-    heading = rotation_about_z(-np.pi / 2 + np.radians(random.uniform(-1, 1)))
-    return rigid(origin, tilt @ heading)

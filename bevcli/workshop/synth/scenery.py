@@ -13,22 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.workshop.synth.catalog import TREE_KINDS, StreetFurniture
+from bevcli.workshop.synth.catalog import TREE_KINDS, StreetFurniture, any_color, nameless
 from bevcli.workshop.synth.city import CORNER_M, DIRECTIONS, KERB_M, Block, CityPlan, right_of, side_of
-from bevcli.workshop.synth.mesh import (
-    Color,
-    Finish,
-    Material,
-    Mesh,
-    TriangleSoup,
-    ball,
-    block,
-    cone,
-    from_faces,
-    joined,
-    linear,
-    rod,
-)
+from bevcli.workshop.synth.mesh import Color, Finish, Material, Mesh, TriangleSoup, from_faces, joined, linear
 from bevcli.workshop.synth.traffic import Signals
 
 Range = tuple[float, float]  # lowest and highest value
@@ -199,13 +186,6 @@ class Looks:
             yield TriangleSoup.from_mesh(nameless(rng)), rng.uniform(4, max(length_m - 4, 5)), rng.uniform(0.8, 4.5)
 
 
-def any_color(rng: np.random.Generator) -> NDArray[np.float32]:
-    """(3,) linear RGB of any brightness; greys are frequent."""
-    grey = rng.random() ** 2
-    color = grey + (rng.random(3) - grey) * rng.random()
-    return np.asarray(0.02 + 0.9 * color, np.float32)
-
-
 def recoloured(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     """The mesh with some of its colours exchanged; glass and lamps stay."""
     albedo = mesh.albedo.copy()
@@ -231,26 +211,6 @@ def bent(mesh: Mesh, rng: np.random.Generator) -> Mesh:
     ], -1)  # fmt: skip
     faces = (low + moved * size).reshape(-1, 3, 3).astype(np.float32)
     return replace(mesh, faces=faces)
-
-
-def nameless(rng: np.random.Generator) -> Mesh:
-    """One to four blocks, balls, cones and poles on top of each other or side by side, 0.3 to 5 m."""
-    parts = []
-    for _ in range(int(rng.integers(1, 5))):
-        length, width, height = np.exp(rng.uniform(np.log(0.2), np.log((3.0, 1.2, 3.0))))
-        x, y, low = *rng.uniform(-0.5, 0.5, 2), float(rng.uniform(0, 1)) * (rng.random() < 0.4)
-        red, green, blue = (int(255 * c) for c in any_color(rng) ** 0.45)
-        color: Color = (red, green, blue)
-        kind = rng.integers(4)
-        if kind == 0:
-            parts.append(block((x, y, low + height / 2), (length, width, height), color))
-        elif kind == 1:
-            parts.append(ball((x, y, low + height / 2), (length / 2, width / 2, height / 2), color))
-        elif kind == 2:
-            parts.append(cone(low, low + height, width / 2, width / 2 * float(rng.random()) + 0.01, color))
-        else:
-            parts.append(rod((x, y, 0), (x + rng.uniform(-1, 1), y, height + 1), 0.03 + 0.1 * rng.random(), color))
-    return joined(parts)
 
 
 BRICK: tuple[Color, ...] = ((150, 82, 62), (128, 66, 54), (168, 108, 80), (110, 74, 64), (178, 130, 98))

@@ -7,23 +7,35 @@ the image, by the pixels near its projected centre.
 """
 
 import contextlib
+import copy
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from bevcli.checkpoints import load_weights
+from bevcli.config import load_config
+from bevcli.errors import ConfigError
 from bevcli.geometry.boxes import BOX_EDGES
-from bevcli.model.network import Network
+from bevcli.inference.load import weights_file
+from bevcli.model.config import ModelConfig
+from bevcli.model.kernels.choose import choose_kernels
+from bevcli.model.kernels.gpu import find_hits_on_cpu
+from bevcli.model.network import Network, build_network
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.model.upload import upload
 from bevcli.workshop.training import losses
-from bevcli.workshop.training.clip_steps import DistillationLossConfig, Lesson, last_outputs
+from bevcli.workshop.training.augmentation import renormalised
+from bevcli.workshop.training.samples import Batch
 from bevcli.workshop.training.targets import AnyTargets, PaddedTargets, Targets, padded
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
@@ -313,6 +325,93 @@ def perspective_loss(
     box_error = config.offset_weight * offset + config.depth_weight * depth
     box_error = (box_error + config.size_weight * size + config.rotation_weight * rotation) / count
     return {"perspective classes": config.weight * classes, "perspective boxes": config.weight * box_error}
+
+
+@dataclass(frozen=True)
+class DistillationLossConfig:
+    """The [training.distillation_loss] table."""
+
+    weight: float = 0.0  # of the mean squared difference of the BEV maps; 0 disables this part
+    feature_weight: float = 0.0  # of that of the neck's maps, by the teacher's variance; it then sees augmented images
+    teacher: str = ""  # weights of the teacher, a file or a model's name
+    model: str = ""  # name or TOML file of the teacher's model; "" for the model that is trained
+
+    def __post_init__(self) -> None:
+        if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
+            raise ValueError(
+                "weight and feature_weight must not be negative, and teacher must name weights where one is positive"
+            )
+
+    @property
+    def active(self) -> bool:
+        """Some part of the loss is not disabled."""
+        return max(self.weight, self.feature_weight) > 0
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """The results of a teacher for one frame of B clips with N cameras."""
+
+    bev: Tensor | None  # (B, Y·X, C) float32; None where only the features are learned
+    features: tuple[Tensor, ...]  # (B·N, C, H, W) float32 of each level of the neck; empty where not learned
+
+
+class Teacher:
+    """The model that another one learns from, in evaluation mode.
+
+    It sees the images and the calibration before they were augmented or, where a model learns its features, the images
+    that the model sees.
+    """
+
+    def __init__(self, model: Network, config: DistillationLossConfig, device: torch.device) -> None:
+        """Raises BevcliError where the weights or the teacher's model are missing, or do not fit the model."""
+        self._config, self._taught = config, model.config
+        self._network = build_network(load_config(config.model)) if config.model else copy.deepcopy(model)
+        load_weights(weights_file(Path(config.teacher)), self._network, config.model)
+        own, other = _maps_of(model.config), _maps_of(self._network.config)
+        if own != other:
+            raise ConfigError(f"{config.model}: cannot teach {model.config.name}: it has {other} (expected {own})")
+        self._network.eval().requires_grad_(False).to(device)
+        choose_kernels(self._network, device)
+        find_hits_on_cpu(self._network, device)
+
+    @torch.no_grad()
+    def lessons(self, clip: Batch) -> Iterator[Lesson]:
+        """The results for each frame of clips, lazily."""
+        image, own, network = self._taught.image, self._network.config.image, self._network
+        memory = None
+        if image != own:
+            clip = replace(
+                clip, inputs=tuple(replace(x, images=renormalised(x.images, image, own)) for x in clip.inputs)
+            )
+        for frame, inputs in enumerate(clip.inputs):
+            bev = None
+            with last_outputs(network.neck) as features:
+                if self._config.weight:
+                    outputs, memory = network.outputs_of_clip(clip, frame, memory)
+                    bev = outputs.bev.float()
+                else:
+                    network.image_features(inputs.images, inputs.camera_index)
+            yield Lesson(bev, tuple(x.float() for x in features[0]) if self._config.feature_weight else ())
+
+
+def _maps_of(config: ModelConfig) -> str:
+    """What a teacher and the model have in common, in words."""
+    sizes = " and ".join(f"{height} x {width}" for height, width in config.level_shapes)
+    grid = config.bev_grid
+    maps = f"{config.neck.levels} maps of {config.channels} channels and {sizes} cells"
+    return f"{maps}, {grid.rows} x {grid.columns} BEV cells"
+
+
+@contextlib.contextmanager
+def last_outputs(module: nn.Module) -> Iterator[deque[Any]]:
+    """Inside, the only item is what the last forward pass of a part returned. No hook remains."""
+    kept = deque[Any](maxlen=1)
+    hook = module.register_forward_hook(lambda module, inputs, outputs: kept.append(outputs))
+    try:
+        yield kept
+    finally:
+        hook.remove()
 
 
 @dataclass(frozen=True)

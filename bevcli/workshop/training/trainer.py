@@ -24,9 +24,13 @@ from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner
 from bevcli.inference.training_rigs import weights_facts
+from bevcli.model.backbone import Backbone
 from bevcli.model.config import ModelConfig
 from bevcli.model.kernels import rounded_products
+from bevcli.model.kernels.choose import fold_batch_norms
+from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.network import Network
+from bevcli.model.step import ModelOutputs
 from bevcli.options import refuse, spread
 from bevcli.parsing.pth import read_pth
 from bevcli.workshop.synth import DriveOptions
@@ -42,8 +46,7 @@ from bevcli.workshop.synth.drives import (
 from bevcli.workshop.synth.rig import RigDistribution, rig_for_rendering
 from bevcli.workshop.training import TrainOptions, ValidationOptions
 from bevcli.workshop.training.augmentation import randomised
-from bevcli.workshop.training.clip_steps import FrozenStages, Lesson, Teacher, forward_clip
-from bevcli.workshop.training.frame_losses import FrameLosses
+from bevcli.workshop.training.frame_losses import FrameLosses, Lesson, Teacher
 from bevcli.workshop.training.job import (
     CHECKPOINT,
     OptimizerConfig,
@@ -95,6 +98,75 @@ def update_average(average: dict[str, Tensor], state: Mapping[str, Tensor], deca
     torch._foreach_lerp_([average[key] for key in moved], [state[key] for key in moved], 1 - decay)
     for key in state.keys() - set(moved):
         average[key].copy_(state[key])
+
+
+def forward_clip(
+    model: Network, batch: Batch, *, learn_all: bool = False, freeze_batch_norm: bool = False
+) -> Iterator[ModelOutputs]:
+    """The outputs, in training mode, for the last frame of a batch of clips.
+
+    The frames before it only build its history, in evaluation mode and without gradient, as in the papers. Of a model
+    with a window of frames, this applies to the image features of the earlier frames.
+
+    Args:
+        learn_all: yield the outputs for every frame. The model may be updated in between: history has no gradient.
+        freeze_batch_norm: keep batch norms in evaluation mode, for fine-tuning.
+    """
+    frames = len(batch.inputs)
+    first_learned = 0 if learn_all else frames - 1
+    memory = None
+    model.eval()
+    with torch.no_grad():
+        for frame in range(first_learned):
+            memory = model.history_of_clip(batch, frame, memory)
+    model.train()
+    for module in model.modules():
+        if freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
+            module.eval()
+    for frame in range(first_learned, frames):
+        outputs, memory = model.outputs_of_clip(batch, frame, memory)
+        yield outputs
+
+
+class FrozenStages:
+    """A copy of the stem and the first stages of a backbone, computed as in inference: faster, the same results.
+
+    Batch norms are folded into their convolutions and, on a CPU, oneDNN runs the residual blocks, one image at a time,
+    whose feature maps fit into the caches.
+    """
+
+    def __init__(self, backbone: Backbone, stages: int, dtype: torch.dtype) -> None:
+        """stages: how many, from the first. dtype: of the computation and its results."""
+        self._device = next(backbone.parameters()).device
+        self._dtype = dtype
+        part = copy.deepcopy(backbone)
+        part.stages = nn.ModuleList(part.stages[:stages])
+        part.output_stages = tuple(range(1, len(part.stages) + 1))
+        part.eval().requires_grad_(False)
+        fold_batch_norms(part, self._device)
+        part.to(dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if self._device.type == "cpu":
+            use_onednn(part)
+        self._part = part
+
+    @contextlib.contextmanager
+    def used_by(self, backbone: Backbone) -> Iterator[None]:
+        """Inside, the backbone takes the maps of its first stages from here."""
+        backbone.frozen_maps = self._maps
+        try:
+            yield
+        finally:
+            backbone.frozen_maps = None
+
+    @torch.no_grad()
+    def _maps(self, images: Tensor) -> list[Tensor]:
+        """images: (B, 3, H, W) -> the map of each stage, without gradient."""
+        with torch.autocast(self._device.type, enabled=False):
+            images = images.to(self._dtype).contiguous(memory_format=torch.channels_last)
+            if self._device.type != "cpu":
+                return list(self._part(images))
+            maps_of_images = [self._part(image) for image in images.split(1)]
+            return [torch.cat(maps) for maps in zip(*maps_of_images, strict=True)]
 
 
 def _numbers_on_their_way(numbers: Mapping[str, Tensor]) -> Callable[[], dict[str, float]]:

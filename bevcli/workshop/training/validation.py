@@ -30,8 +30,7 @@ from bevcli.printing import counted, one_line
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import count_labels, scenes_of
-from bevcli.workshop.scores.config import DetectionConfig
-from bevcli.workshop.scores.detection import evaluate_detections
+from bevcli.workshop.scores.detection import DetectionConfig, evaluate_detections
 from bevcli.workshop.scores.evaluate import FrameScores, boxes_ego, evaluate_segmentation, finite
 from bevcli.workshop.scores.inputs import Compared, FramePairs
 from bevcli.workshop.scores.tracking import score_tracks
