@@ -207,7 +207,12 @@ class Session:
         )
 
     def _next_stamp(self, timestamp_ns: int) -> FrameStamp:
-        time = whole_nanoseconds(timestamp_ns)
+        try:
+            time = index(timestamp_ns)
+        except TypeError:
+            found = f"{type(timestamp_ns).__name__} {timestamp_ns!r:.40}"
+            advice = "pass round(seconds * 1e9)" if isinstance(timestamp_ns, float | np.floating) else "pass an int"
+            raise InputError(f"`timestamp_ns`: expected whole nanoseconds (found {found}): {advice}") from None
         if self._last_ns is not None and time <= self._last_ns:
             raise InputError(
                 f"`timestamp_ns={time}`: is not later than the frame before ({self._last_ns}): pass frames in order, "
@@ -234,13 +239,3 @@ def _pose(pose: Pose | ArrayLike, argument: str) -> Pose:
     if not is_rigid:
         raise InputError(f"{argument}: is not a rigid transform (expected a rotation and a translation, all finite)")
     return Pose.from_matrix(matrix)
-
-
-def whole_nanoseconds(timestamp_ns: Any) -> int:
-    """A time as an integer. Raises InputError for any other type, such as seconds as a float."""
-    try:
-        return index(timestamp_ns)
-    except TypeError:
-        found = f"{type(timestamp_ns).__name__} {timestamp_ns!r:.40}"
-        advice = "pass round(seconds * 1e9)" if isinstance(timestamp_ns, float | np.floating) else "pass an int"
-        raise InputError(f"`timestamp_ns`: expected whole nanoseconds (found {found}): {advice}") from None

@@ -80,7 +80,11 @@ class Worker:
             except Exception as failure:  # whatever one drive raises, the others go on
                 reason = " ".join(str(failure).split())[:300]
                 error = f"{type(failure).__name__}: {reason}" if reason else type(failure).__name__
-                self._check_device()
+                if self._model.device.type == "cuda":
+                    try:
+                        torch.zeros(1, device=self._model.device).cpu()
+                    except RuntimeError:  # after some errors CUDA fails until the process is replaced
+                        os._exit(1)
             else:
                 self._out.remove(marker)
                 yield record
@@ -183,14 +187,6 @@ class Worker:
         finally:
             shutil.rmtree(inputs, ignore_errors=True)
             shutil.rmtree(aside, ignore_errors=True)
-
-    def _check_device(self) -> None:
-        """End this process if its GPU no longer works: after some errors, CUDA fails until the process is replaced."""
-        if self._model.device.type == "cuda":
-            try:
-                torch.zeros(1, device=self._model.device).cpu()
-            except RuntimeError:
-                os._exit(1)
 
 
 def use_threads(count: int) -> None:

@@ -178,16 +178,12 @@ def _document(proto: object, inputs: tuple[Port, ...], outputs: tuple[Port, ...]
     for value in (*graph.input, *graph.output):
         value.doc_string = meanings[value.name]
     for node in graph.node:
-        node.name = f"{_block_of(node)}/{node.name}"
+        scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]
+        parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
+        # The part of the network that it belongs to, such as "backbone.stages.0.0"; "" outside of all parts.
+        node.name = f"{parts[-1] if parts else ''}/{node.name}"
         # Where a node came from in our source code: a third of the file, and of use to nobody who runs it.
         del node.metadata_props[:]
-
-
-def _block_of(node: object) -> str:
-    """The part of the network that a node belongs to, such as "backbone.stages.0.0"; "" outside of all parts."""
-    scopes = [entry.value for entry in node.metadata_props if entry.key == NAME_SCOPES]  # type: ignore[attr-defined]
-    parts = re.findall(r"'network\.([\w.]+)'", scopes[0] if scopes else "")
-    return parts[-1] if parts else ""
 
 
 @dataclass(frozen=True)

@@ -203,7 +203,11 @@ class StressTest:
         memory, scenes = FrameMemory(KEPT_BYTES), [scene for drive in drives for scene in split_scenes(drive)]
         self._scenes = [KeptFrames(scene, memory, index) for index, scene in enumerate(scenes)]
         self._against = None if options.against is None else read_results(options.against)
-        self._fingerprint = _fingerprint_of(self._model, drives, replace(options, against=None))
+        # All that the results depend on, apart from the conditions.
+        fingerprints = [run_fingerprint(self._model, drive, replace(options, against=None)) for drive in drives]
+        names = _INPUT_KEYS if len(drives) > 1 else ()
+        together = {name: digest(tuple(of_drive[name] for of_drive in fingerprints))[:12] for name in names}
+        self._fingerprint = fingerprints[0] | together | {"drives": ", ".join(drive.name for drive in drives)}
         self._folder = RunFolder(out, force=force, resume=resume)
         self._range_m = options.max_range_m or self._model.config.bev_grid.nearest_side_m
         self._metrics = DetectionConfig.of(self._model.config.object_classes).cut_at(self._range_m)
@@ -312,15 +316,6 @@ def split_scenes(drive: Drive) -> list[Drive]:
     if not drive.stamps:
         raise InputError(f"{drive.name}: has no frames")
     return [select(drive, indices) for indices in scenes_of(drive.stamps)]
-
-
-def _fingerprint_of(model: Model, drives: Sequence[Drive], options: StressOptions) -> dict[str, str]:
-    """All that the results depend on, apart from the conditions."""
-    fingerprints = [run_fingerprint(model, drive, options) for drive in drives]
-    fingerprint = dict(fingerprints[0])
-    if len(fingerprints) > 1:
-        fingerprint |= {name: digest(tuple(of_drive[name] for of_drive in fingerprints))[:12] for name in _INPUT_KEYS}
-    return fingerprint | {"drives": ", ".join(drive.name for drive in drives)}
 
 
 def stress_table(results: StressResults, against: StressResults | None = None) -> str:

@@ -50,7 +50,9 @@ def evaluate(
     if options.csv is not None and options.csv == options.latex:
         raise InputError(f"--latex: {options.latex} is the file of --csv too (expected two files): name another")
     scores: Any
-    if len(predictions) == 1 and _is_unlabelled(ground_truth):
+    # Of a format that has labels, the reading of them tells.
+    unlabelled = is_drive(ground_truth) and not format_of(ground_truth).annotated
+    if len(predictions) == 1 and unlabelled and not (ground_truth / "ground_truth.json").exists():
         given = {**vars(options), **vars(results)}
         if refused := [name for name, value in given.items() if value and name not in ("worst", "csv", "latex")]:
             raise InputError(f"--{refused[0].replace('_', '-')}: {ground_truth} has no ground truth: remove it")
@@ -80,11 +82,6 @@ def evaluate(
     if options.plot is not None:
         for path in scores.write_plots(options.plot):
             say(f"wrote {path}", err=True)
-
-
-def _is_unlabelled(path: Path) -> bool:
-    """Whether a path is a drive without labels; of a format that has labels, the reading of them tells."""
-    return is_drive(path) and not format_of(path).annotated and not (path / "ground_truth.json").exists()
 
 
 def _print_agreement(

@@ -182,7 +182,10 @@ class RecallCurve:
         first, last = round(100 * config.min_recall) + 1, int(np.flatnonzero(self.score).max(initial=0))
         if last < first:
             return 1.0
-        along = np.interp(self.score[::-1], scores[::-1], _running_mean(errors)[::-1])[::-1]
+        counts = np.cumsum(~np.isnan(errors))
+        running = np.divide(np.nancumsum(errors), counts, out=np.zeros(len(errors)), where=counts > 0)
+        running = running if counts.any() else np.ones(len(errors))  # as in the devkit
+        along = np.interp(self.score[::-1], scores[::-1], running[::-1])[::-1]
         return float(np.mean(along[first : last + 1]))
 
 
@@ -197,14 +200,6 @@ def recall_curve(is_match: NDArray[np.bool_], scores: Array, ground_truth_count:
     precision = true_positives / np.arange(1, len(is_match) + 1)
     recall = true_positives / ground_truth_count
     return RecallCurve(*(np.interp(RECALLS, recall, values, right=0) for values in (precision, scores)))
-
-
-def _running_mean(values: Array) -> Array:
-    is_known = ~np.isnan(values)
-    if not is_known.any():
-        return np.ones(len(values))  # as in the devkit
-    counts = np.cumsum(is_known)
-    return np.divide(np.nancumsum(values), counts, out=np.zeros(len(values)), where=counts > 0)
 
 
 @dataclass(frozen=True)
@@ -347,7 +342,9 @@ def evaluate_detections(
     sides = (gather(side, ego) for side in (ground_truth, predictions))
     truth, predicted = (side[side.column("num_points") != 0] for side in sides)
     matches = tuple(match_class(name, truth, predicted, config) for name in config.class_ranges_m)
-    return DetectionScores(len(predictions), matches, _unmeasured(truth), config)
+    unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
+    unmeasured = tuple(name for name, is_unknown in unknown.items() if len(truth) and is_unknown.all())
+    return DetectionScores(len(predictions), matches, unmeasured, config)
 
 
 def _score_class(matches: ClassMatches, config: DetectionConfig, unmeasured: tuple[str, ...]) -> ClassScores:
@@ -407,9 +404,3 @@ def _pair_errors(truths: ScoredBoxes, predictions: ScoredBoxes, *, symmetric: bo
         np.where(attributes == "", np.nan, attributes != predictions.column("attributes")),
     )
     return dict(zip(ERRORS, errors, strict=True))
-
-
-def _unmeasured(truth: ScoredBoxes) -> tuple[str, ...]:
-    """The errors whose quantity no ground truth has."""
-    unknown = {"vel_err": np.isnan(truth.boxes.velocities).any(axis=1), "attr_err": truth.column("attributes") == ""}
-    return tuple(name for name, is_unknown in unknown.items() if len(truth) and is_unknown.all())

@@ -128,6 +128,11 @@ class WorstFrames:
 def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
     """The worst frames of one model or two, whose boxes are scored. Two have the same frames."""
     missed, invented, boxes = [], [], np.zeros(0, np.int64)
+    truth, starts = models[0].truth, dict[str, int]()
+    # Of a nuScenes root frames count from 0 in the scene that is opened; without it, all scenes are shown.
+    if truth is not None and "scene" not in models[0].selection and is_nuscenes_root(truth.path):
+        for frame in truth.boxes.frames:
+            starts.setdefault(frame.stamp.scene, frame.stamp.index)
     for model in models:
         assert model.detection is not None
         config, frame_count = model.detection.config, model.detection.frame_count
@@ -143,7 +148,7 @@ def find_worst_frames(models: Sequence[Compared], count: int) -> WorstFrames:
         count,
         config.error_distance_m,
         _command(models),
-        _scene_starts(models[0]),
+        starts,
     )
 
 
@@ -163,12 +168,3 @@ def _command(models: Sequence[Compared]) -> tuple[str, ...]:
     boxes = [word for file in files for word in ("--boxes", str(file))]
     selection = [word for name, value in models[0].selection.items() for word in (f"--{name}", value)]
     return ("bevcli", "viz", str(drive), *boxes, *selection)
-
-
-def _scene_starts(model: Compared) -> dict[str, int]:
-    """Of a nuScenes root, whose frames count from 0 in the scene that is opened; without it, all scenes are shown."""
-    truth, starts = model.truth, dict[str, int]()
-    if truth is not None and "scene" not in model.selection and is_nuscenes_root(truth.path):
-        for frame in truth.boxes.frames:
-            starts.setdefault(frame.stamp.scene, frame.stamp.index)
-    return starts

@@ -140,7 +140,12 @@ class RenderedDrives(FolderDrives):
                 cameras = tuple(camera.scaled(network_scale(camera, sized)) for camera in rig.cameras)
                 fitting = replace(rig, cameras=cameras)
             self._rigs = [DrawnRig(fitting)] * len(seeds)
-            name += "" if rig is None else f"-rig-{_digest(fitting)}"
+            facts = [
+                (c.name, c.width, c.height, c.intrinsics.tolist(), c.ego_from_camera.tolist(), c.distortion)
+                for c in fitting.cameras
+            ]
+            digest = hashlib.sha256(repr((facts, fitting.ego_from_bev.tolist())).encode()).hexdigest()[:8]
+            name += "" if rig is None else f"-rig-{digest}"
         super().__init__([cache / name / f"{seed:06d}" for seed in seeds], config, class_map)
         self._seeds, self._config = tuple(seeds), config
         self._rendering = threading.Lock()
@@ -178,15 +183,6 @@ class RenderedDrives(FolderDrives):
             if not folder.exists():
                 raise
             shutil.rmtree(unfinished)  # another process has rendered the same drive meanwhile
-
-
-def _digest(rig: CameraRig) -> str:
-    """Eight hexadecimal digits that differ between rigs."""
-    parts = [
-        (c.name, c.width, c.height, c.intrinsics.tolist(), c.ego_from_camera.tolist(), c.distortion)
-        for c in rig.cameras
-    ]
-    return hashlib.sha256(repr((parts, rig.ego_from_bev.tolist())).encode()).hexdigest()[:8]
 
 
 def count_frames(drives: Drives) -> int:

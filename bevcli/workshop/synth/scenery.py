@@ -289,10 +289,13 @@ def _house(
     corners += setback * np.sign(corners.mean(0) - corners)
     ground = city.bend(corners)
     walls, rows = zip(*(_wall(ground[k], ground[(k + 1) % 4], height, style) for k in range(4)), strict=True)
-    rest = [_roof(ground, height, style)]
+    middle = ground.mean(0)  # the roof is a flat slab that overhangs the walls by 0.25 m
+    wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
+    slab = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
+    red, green, blue = (int(component * 0.8) for component in style.wall)
+    rest = [_prism(slab, (red, green, blue) if style.band else ROOF)]
     if style.shop_m > 1:
         rest += _awnings(rng, ground)
-    middle = ground.mean(0)
     for _ in range(int(rng.integers(0, 3))):
         at = middle + rng.uniform(-3, 3, 2)
         square = at + np.array([(1.1, 0.8), (-1.1, 0.8), (-1.1, -0.8), (1.1, -0.8)])
@@ -312,15 +315,6 @@ def _wall(start: Array, end: Array, height: float, style: FacadeStyle) -> tuple[
         float(style.band) + 2.0 * style.seed, *linear(style.wall),
     ]  # fmt: skip
     return mesh, np.array(row, np.float32)
-
-
-def _roof(ground: Array, height: float, style: FacadeStyle) -> Mesh:
-    """A flat slab that overhangs the walls by 0.25 m."""
-    middle = ground.mean(0)
-    wide = middle + (ground - middle) * (1 + 0.25 / np.linalg.norm(ground - middle, axis=1, keepdims=True))
-    rings = [np.column_stack([wide, np.full(4, z)]) for z in (height - 0.22, height + 0.12)]
-    red, green, blue = (int(component * 0.8) for component in style.wall)
-    return _prism(rings, (red, green, blue) if style.band else ROOF)
 
 
 def _awnings(rng: np.random.Generator, ground: Array) -> Iterator[Mesh]:
@@ -391,17 +385,13 @@ class Scenery:
             meshes += houses(self.city, land)
         rng = self.city.stream("furniture", column, row)
         if use == "park":
-            meshes += self._park(land, rng)
+            low, high = land.inside(1.5)
+            for point in low + rng.random((int(np.prod(high - low) / 75), 2)) * (high - low):
+                kinds = self.furniture.trees if rng.random() < 0.7 else self.furniture.bushes
+                meshes.append(self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3)))
         for side in range(4):
             meshes += self._side(land, side, rng)
         return meshes
-
-    def _park(self, land: Block, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-        low, high = land.inside(1.5)
-        count = int(np.prod(high - low) / 75)
-        for point in low + rng.random((count, 2)) * (high - low):
-            kinds = self.furniture.trees if rng.random() < 0.7 else self.furniture.bushes
-            yield self._put(kinds[int(rng.integers(len(kinds)))], point, rng.uniform(0, 6.3))
 
     def _side(self, land: Block, side: int, rng: np.random.Generator) -> Iterator[TriangleSoup]:
         """The pavement on one side of a block: trees, lamps and signs near the kerb, benches and bins between them."""

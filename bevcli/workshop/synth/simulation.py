@@ -395,7 +395,9 @@ class Simulation:
         self._populate(vehicles, 0.0, start)
         for k in range(steps):
             time_s = start + k * traffic.STEP_S
-            traffic.step(vehicles, self._people_on_roads(vehicles, time_s), self.signals, time_s)
+            nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})  # that vehicles approach
+            people = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
+            traffic.step(vehicles, self.city.bend(np.array(people).reshape(-1, 2)), self.signals, time_s)
             if k % 10 == 9:
                 gone += self._renew(vehicles, time_s + traffic.STEP_S)
         seen = [vehicle for vehicle in [*gone, *vehicles[1:]] if len(vehicle.track) > 1]
@@ -430,9 +432,3 @@ class Simulation:
             vehicles.remove(vehicle)
         self._populate(vehicles, 58.0, time_s)
         return gone
-
-    def _people_on_roads(self, vehicles: list[traffic.Vehicle], time_s: float) -> Array:
-        """(H, 2) world points of people on the road at the junctions that vehicles approach."""
-        nodes = sorted({p.node for v in vehicles if (p := v.next_pass()) is not None})
-        points = [w.plan_at(time_s) for node in nodes for w in self._crossers(node) if w.on_road(time_s)]
-        return self.city.bend(np.array(points).reshape(-1, 2))

@@ -17,7 +17,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
-from bevcli.workshop.training.targets import AnyMasks, AnyTargets, PaddedMasks, PaddedTargets, padded, padded_masks
+from bevcli.workshop.training.targets import AnyMasks, AnyTargets, PaddedTargets, padded, padded_masks
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
 UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
@@ -227,7 +227,11 @@ def segmentation_loss(
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
     """
     truth, first = padded_masks(targets), len(STUFF_CLASSES)
-    _, queries = hungarian_matchings(mask_matching_costs(outputs, truth, config), truth.counts)  # (B, G)
+    with torch.no_grad():  # (B, T, G) of each thing query and each vehicle, by the last layer
+        costs = config.class_weight * focal_cost(outputs.class_logits[-1, :, first:])[..., None]
+        costs = costs + config.location_weight * torch.cdist(outputs.locations[-1], truth.locations, p=1)
+        costs = costs + config.dice_weight * dice_costs(outputs.mask_logits[-1, :, first:], truth.things)
+    _, queries = hungarian_matchings(costs, truth.counts)  # (B, G)
     assigned = torch.cat([truth.stuff.any(-1), queries >= 0], 1).float()  # (B, S + G)
     queries = queries.clamp(min=0) + first
     stuff, things = assigned[:, :first].sum().clamp(min=1), assigned[:, first:].sum().clamp(min=1)
@@ -258,16 +262,6 @@ def _of_queries(tensor: Tensor, queries: Tensor) -> Tensor:
     """(M, B, Q, ...) -> (M, B, G, ...), those of the queries (B, G)."""
     index = queries[None, ..., None].expand(len(tensor), -1, -1, tensor.shape[-1])
     return tensor.gather(2, index)
-
-
-def mask_matching_costs(outputs: SegmentationOutputs, truth: PaddedMasks, config: SegmentationLossConfig) -> Tensor:
-    """(B, T, G) cost of assigning each thing query to each vehicle, by the last layer. No gradient."""
-    first = len(STUFF_CLASSES)
-    with torch.no_grad():
-        classes = focal_cost(outputs.class_logits[-1, :, first:])[..., None]
-        locations = torch.cdist(outputs.locations[-1], truth.locations, p=1)
-        dice = dice_costs(outputs.mask_logits[-1, :, first:], truth.things)
-        return config.class_weight * classes + config.location_weight * locations + config.dice_weight * dice
 
 
 def dice_loss(logits: Tensor, targets: Tensor) -> Tensor:

@@ -228,24 +228,20 @@ def score_drives(
             boxes[index].append(boxes_ego(frame, frame.ground_truth, prediction, classes))
         if prediction.segmentation is not None and frame.ground_truth_map is not None:
             maps.append((prediction.segmentation, frame.ground_truth_map))
+    of_drives = []
+    for drive, of_drive in zip(map(drives.open, range(len(drives))), boxes, strict=True) if each_drive else ():
+        table = evaluate_detections(*_sides(of_drive), config).overall.of_classes_with_ground_truth()
+        of_drives.append(DriveScores(drive.name, len(drive.rig.cameras), table.mean_ap, table.nd_score))
     return Validation(
         evaluate_detections(*_sides([pair for of_drive in boxes for pair in of_drive]), config),
         evaluate_segmentation(maps) if maps else None,
         score_tracks(Compared(_pairs(tracks), classes, range_m)) if tracked else None,
-        drives=tuple(_each_drive(drives, boxes, config)) if each_drive else (),
+        drives=tuple(of_drives),
     )
 
 
 def _sides(pairs: list[tuple[Boxes3D, Boxes3D]]) -> tuple[list[Boxes3D], list[Boxes3D]]:
     return [predicted for predicted, _ in pairs], [true for _, true in pairs]
-
-
-def _each_drive(
-    drives: Drives, boxes: Sequence[list[tuple[Boxes3D, Boxes3D]]], config: DetectionConfig
-) -> Iterator[DriveScores]:
-    for drive, of_drive in zip(map(drives.open, range(len(drives))), boxes, strict=True):
-        table = evaluate_detections(*_sides(of_drive), config).overall.of_classes_with_ground_truth()
-        yield DriveScores(drive.name, len(drive.rig.cameras), table.mean_ap, table.nd_score)
 
 
 def drives_table(drives: Sequence[DriveScores]) -> str:

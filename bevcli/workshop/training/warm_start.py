@@ -222,20 +222,16 @@ def named_rows(checkpoint: Checkpoint, model: Network, drives: Drives) -> dict[s
         name: next(((label,) for label in (name, likes.get(name, "")) if label in classes), ())
         for name in config.classes
     }
-    rows = dict.fromkeys(_class_keys(model), NamedRows("class rows", classes, starts_of_classes))
-    if model.image_tokens.camera_embedding is not None:
-        starts, remark = _views(config.cameras, cameras, drives), "; by heading where it is known; all are trained"
-        rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
-    return rows
-
-
-def _class_keys(model: Network) -> list[str]:
-    """Keys of the tensors that have a row for each class."""
     layers = [
         f"detection_head.class_branches.{branch}.{[*modules.named_children()][-1][0]}"
         for branch, modules in model.detection_head.class_branches.named_children()
     ]
-    return [f"{layer}.{parameter}" for layer in layers for parameter in ("weight", "bias")]
+    keys = [f"{layer}.{parameter}" for layer in layers for parameter in ("weight", "bias")]
+    rows = dict.fromkeys(keys, NamedRows("class rows", classes, starts_of_classes))
+    if model.image_tokens.camera_embedding is not None:
+        starts, remark = _views(config.cameras, cameras, drives), "; by heading where it is known; all are trained"
+        rows[CAMERA_EMBEDDING] = NamedRows("camera embeddings", cameras, starts, remark)
+    return rows
 
 
 def _names(checkpoint: Checkpoint, config: ModelConfig, what: Literal["classes", "cameras"]) -> tuple[str, ...]:

@@ -403,20 +403,15 @@ class UniAD(BEVFormer):
         """The tracks and objects in the BEV map (1, Y·X, C): `forward` after the encoder, without the map."""
         # In float32, as the decoder of BEVFormer.
         with without_autocast(bev.device):
-            queries = self._queries(tracks, motion)
+            queries = self.decoder.object_queries(batch=1)  # the learned ones, then those of the tracks
+            if tracks is not None and len(tracks):
+                assert motion is not None
+                heights = self.decoder.reference_points(tracks.position)[:, 2].sigmoid()
+                queries = with_tracks(queries, tracks, motion, heights, self.config.bev_grid)
             class_logits, box_codes, embedding = self.decoder(bev.float(), self.detection_head, queries)
             scores = class_logits[-1, 0].sigmoid().amax(-1)
             ids, kept = self._tracks(queries, embedding[0], box_codes[-1, 0], scores, tracks)
         return UniADOutputs(bev, class_logits, box_codes, ids=ids, scores=scores, tracks=kept)
-
-    def _queries(self, tracks: TrackQueries | None, motion: FrameMotion | None) -> ObjectQueries:
-        """The queries of a frame: the learned ones, then those of the tracks."""
-        learned = self.decoder.object_queries(batch=1)
-        if tracks is None or not len(tracks):
-            return learned
-        assert motion is not None
-        heights = self.decoder.reference_points(tracks.position)[:, 2].sigmoid()
-        return with_tracks(learned, tracks, motion, heights, self.config.bev_grid)
 
     def _tracks(
         self, queries: ObjectQueries, embedding: Tensor, codes: Tensor, scores: Tensor, before: TrackQueries | None
