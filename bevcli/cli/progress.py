@@ -4,7 +4,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
@@ -178,11 +178,15 @@ def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedW
     return fetch_weights(weights, force=force)
 
 
-def load_with_bar(options: ModelOptions) -> "Model":
-    """The model of the options, whose weights are downloaded where `fetch` asks for it and they are not there."""
-    from bevcli.inference.load import load_model, weights_to_fetch
+def load_with_bar(options: ModelOptions, drives: Sequence[Path] | None = ()) -> tuple["Model", tuple[str, ...]]:
+    """The model of the options, or one of the package for the drives, and a note on that choice (`choose_model`).
 
+    Its weights are downloaded where `fetch` asks for it and they are not there.
+    """
+    from bevcli.inference.load import choose_model, load_model, weights_to_fetch
+
+    options, notes = choose_model(options, drives)
     weights = weights_to_fetch(options)
     if weights is not None:
         fetch_with_bar(weights)
-    return load_model(options=options)
+    return load_model(options=options), notes

@@ -55,15 +55,13 @@ def run(
     Ctrl-C or SIGTERM finish the current frame; a second one ends the program at once.
     """
     gc.disable()  # a fifth faster: of the million objects of the packages, hardly any is garbage
-    from bevcli.inference.load import choose_model
     from bevcli.runs.run_into_folder import run_in_folder
     from bevcli.workshop.checks.standing_check import StandingCheck
 
     gc.enable()
     if not gc.get_freeze_count():
         gc.freeze()  # later collections do not look at these objects either
-    model, why = choose_model(model, [sequence])
-    loaded = load_with_bar(model)
+    loaded, why = load_with_bar(model, [sequence])
     may_have_poses = format_of(sequence).has_poses and not holds_videos_alone(sequence)
     if source.ego_motion == "required" and not (
         format_options.get("ego_motion_file") or may_have_poses or source.odometry

@@ -312,7 +312,7 @@ def test_a_command_shows_the_download_of_its_models_weights(server, model, tmp_p
     add_source(model, f"{url}/whole/weights.safetensors")
     options = ModelOptions(model="own", device="cpu", fetch=True)
     for _ in range(2):
-        assert load_with_bar(options).weights == tmp_path / "weights/own/weights.safetensors"
+        assert load_with_bar(options)[0].weights == tmp_path / "weights/own/weights.safetensors"
     assert capsys.readouterr().err.startswith(f"note: own: {url}/whole/weights.safetensors\n")
     assert len(handler.asked) == 1
 

@@ -64,7 +64,7 @@ def batch(
         raise typer.BadParameter("is for --resume", param_hint="--retry-failed")
     run_options = replace(run_options, recording=recording)
     job, found, notes = work.job_of(drives or [], options, workers, model, run_options, format_options)
-    loaded = load_with_bar(work.options_to_load(job, workers, fetch=model.fetch))
+    loaded, _ = load_with_bar(work.options_to_load(job, workers, fetch=model.fetch))
     summary = _run(work.prepare_batch(job, loaded, found, notes, options, workers, source, format_options))
     say(summary.table())
     if summary.failed:
@@ -148,7 +148,7 @@ def reproduce(
         evaluate=True,
         retries=workers.retries,
     )
-    loaded = load_with_bar(work.options_to_load(job, workers))
+    loaded, _ = load_with_bar(work.options_to_load(job, workers))
     job = replace(job, source=InputOptions().for_model(loaded.config, temporal=run_options.temporal))
     summary = _run(work.Batch(job, loaded, drives, workers, notes, resume=options.resume, retry_failed=options.resume))
     if not any(record.get("scores") for record in summary.records):

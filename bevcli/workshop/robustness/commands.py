@@ -40,15 +40,13 @@ def stress(
     The table has NDS and mAP by corruption and severity, and mRR, the share of the clean NDS that is left. No training
     of bevcli uses the five others. Ctrl-C or SIGTERM end the test after the current frame; `--resume` goes on with it.
     """
-    from bevcli.inference.load import choose_model
     from bevcli.workshop.robustness import conditions, stress as work
 
     chosen_conditions = conditions.choose_conditions(output.severity, output.only)
     other = None if options.against is None else work.read_results(options.against)
     if bool(sequence) == (drive_options.rendered is not None):
         raise InputError("choose the drives: give either SEQUENCE folders or --rendered SEEDS, not both")
-    model, why = choose_model(model, sequence or None)
-    loaded = load_with_bar(model)
+    loaded, why = load_with_bar(model, sequence or None)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
         drives = [bevcli.open_sequence(path, chosen, **format_options) for path in sequence or ()]
