@@ -9,7 +9,6 @@ from importlib import resources
 from pathlib import Path
 
 import safetensors
-import safetensors.torch
 import torch
 from torch import Tensor
 
@@ -21,7 +20,6 @@ from bevcli.parsing.files import open_regular
 from bevcli.parsing.pth import Placeholder, read_pth
 from bevcli.printing import counted
 from bevcli.registry import entries, load
-from bevcli.writing import check_output, write_whole
 
 # The types of numbers that weights may have, and the end of the only keys whose numbers are integers.
 FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
@@ -115,22 +113,6 @@ def require_fit(checkpoint: Checkpoint, model: str, expected: Mapping[str, Tenso
     )
 
 
-def convert(source: Path, destination: Path) -> Checkpoint:
-    """Writes a weights file as .safetensors with our key names; returns what it then contains.
-
-    Raises WeightsError where the file fits none of the known models.
-    """
-    checkpoint = read_checkpoint(source)
-    if not checkpoint.models:
-        raise WeightsError(f"{source}: {checkpoint.misfit}")
-    if destination.suffix != ".safetensors":
-        raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
-    tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
-    check_output(destination, source)
-    write_whole(destination, safetensors.torch.save(tensors, {**checkpoint.facts, "model": checkpoint.models[0]}))
-    return read_checkpoint(destination)
-
-
 def read_checkpoint(path: Path) -> Checkpoint:
     """Reads an official .pth or a .safetensors, with official key names or ours.
 
@@ -150,8 +132,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
     _check_numbers(path, state)
     official = any(key.startswith(OFFICIAL) for key in state)
     if official:
-        from bevcli.checkpoints import from_official
-
         state, parts = from_official(state)
         left_out += [parts] if parts else []
     return Checkpoint(path, state, official, facts, " and ".join(left_out), not_read)

@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 from bevcli.checkpoints import (
     bundled_weights,
     compare,
-    convert,
     expected_state,
     from_official,
     load_weights,
@@ -32,7 +31,7 @@ from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.training.warm_start import warm_start
 from bevcli.workshop.weights import model_file as parts
-from bevcli.workshop.weights.model_file import model_file_for, model_parts
+from bevcli.workshop.weights.model_file import convert, model_file_for, model_parts
 
 KEYS = json.loads((Path(__file__).parent / "data" / "golden_keys.json").read_text())
 

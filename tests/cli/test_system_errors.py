@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from command_line import command
 
-from bevcli.checkpoints import convert
 from bevcli.cli import main
 from bevcli.errors import OutputError
+from bevcli.workshop.weights.model_file import convert
 
 PROGRAM = [sys.executable, "-m", "bevcli"]
 

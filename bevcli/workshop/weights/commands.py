@@ -128,7 +128,7 @@ def convert(
 
     It must fit one of our models.
     """
-    from bevcli.checkpoints import convert as convert_file
+    from bevcli.workshop.weights.model_file import convert as convert_file
 
     if destination.exists() and not force:
         raise OutputError(f"{destination}: already exists; choose another name, or pass --force to overwrite it")

@@ -1,4 +1,4 @@
-"""The model file of weights that fit a known model but for its classes."""
+"""The model file of weights that fit a known model but for its classes, parts of a model, other files of weights."""
 
 import contextlib
 import json
@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
 
-from bevcli.checkpoints import difference, expected_state, read_checkpoint
+from bevcli.checkpoints import Checkpoint, difference, expected_state, read_checkpoint
 from bevcli.config import as_toml, config_of_table, load_config, read_model_file
 from bevcli.errors import OutputError, WeightsError
 from bevcli.model.config import ModelConfig
@@ -18,7 +19,7 @@ from bevcli.model.temporal_model import build_model
 from bevcli.options import gather
 from bevcli.printing import counted
 from bevcli.workshop.weights import ModelFileOptions
-from bevcli.writing import write_whole
+from bevcli.writing import check_output, write_whole
 
 
 def model_file_for(
@@ -123,3 +124,19 @@ def parts_as_text(model: str, parts: tuple[ModelPart, ...]) -> str:
 
 def _text(shape: Shape) -> str:
     return " × ".join(map(str, shape))
+
+
+def convert(source: Path, destination: Path) -> Checkpoint:
+    """Writes a weights file as .safetensors with our key names; returns what it then contains.
+
+    Raises WeightsError where the file fits none of the known models.
+    """
+    checkpoint = read_checkpoint(source)
+    if not checkpoint.models:
+        raise WeightsError(f"{source}: {checkpoint.misfit}")
+    if destination.suffix != ".safetensors":
+        raise WeightsError(f"{destination}: expected a file name that ends in .safetensors")
+    tensors = {key: tensor.contiguous() for key, tensor in checkpoint.state.items()}
+    check_output(destination, source)
+    write_whole(destination, safetensors.torch.save(tensors, {**checkpoint.facts, "model": checkpoint.models[0]}))
+    return read_checkpoint(destination)
