@@ -376,10 +376,8 @@ class Recording:
         in_world, colors = shown.transformed(poses.world_from_bev), log_boxes.box_colors(shown, classes)
         files = self._recorded.files
         is_label = files is not None and not files.names  # the names of labelled objects are long
-        corners, texts = (
-            in_world.corners(),
-            log_cameras.box_labels(replace(shown, instances=None) if is_label else shown),
-        )
+        corners = in_world.corners()
+        texts = log_cameras.box_labels(replace(shown, instances=None) if is_label else shown)
         labels = poses.labels(shown, texts, log_boxes.LABELS_IN_SCENE)
         log_boxes.log_boxes_3d(stream, in_world, corners, marks, classes, labels)
         for name in self._with_meshes:

@@ -252,10 +252,8 @@ def check_lenses(cameras: Sequence[Camera]) -> list[Finding]:
             message, advice = "the principal point is far from the image centre", "correct only for cropped images"
             findings.append(Finding("principal-point", "warning", camera.name, message, found, expected, advice))
         if camera.distortion is None and seen_fov_deg(camera)[0] > WIDE_PINHOLE_DEG:
-            found, message = (
-                f"{seen_fov_deg(camera)[0]:.0f}°",
-                "the field of view is wide, but there is no lens distortion",
-            )
+            found = f"{seen_fov_deg(camera)[0]:.0f}°"
+            message = "the field of view is wide, but there is no lens distortion"
             advice = "add the lens model, or undistort the images"
             findings.append(Finding("distortion-missing", "warning", camera.name, message, found, advice=advice))
     return findings

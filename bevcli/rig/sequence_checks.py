@@ -144,10 +144,8 @@ def _best_explanation(camera: Camera, explained: Mapping[str, Sequence[Mistake]]
 
 def _misfit(mistake: Mistake, camera: Camera) -> float:
     """Pitch, roll and angle to the named direction of the pose after undoing the mistake, summed, degrees."""
-    mounting, named = (
-        rig_checks.mounting_of(mistake.undo(camera.ego_from_camera)),
-        rig_checks.direction_of_name(camera.name),
-    )
+    mounting = rig_checks.mounting_of(mistake.undo(camera.ego_from_camera))
+    named = rig_checks.direction_of_name(camera.name)
     off_name = 0.0 if named is None else rig_checks.turn_deg(named, mounting.yaw_deg)
     return abs(mounting.pitch_deg) + abs(mounting.roll_deg) + off_name
 
@@ -252,11 +250,8 @@ def rig_findings(rig: CameraRig, found_before: Sequence[Finding] = ()) -> list[F
     poses, swapped, bev = list[Finding](), list[Finding](), list[Finding]()
     wrong = {finding.camera for finding in errors_of(found_before)}
     cameras = [camera for camera in rig.cameras if camera.name not in wrong]
-    has_defects, has_bev = (
-        any(map(rig_checks.pose_defects, cameras)),
-        rig_checks.is_plausible_bev_frame(rig.ego_from_bev),
-    )
-    if has_defects:
+    has_bev = rig_checks.is_plausible_bev_frame(rig.ego_from_bev)
+    if any(map(rig_checks.pose_defects, cameras)):
         poses = pose_errors(cameras)
         # Swapped names of cameras whose poses share another mistake, such as all inverted, are seen once it is undone.
         swapped = [

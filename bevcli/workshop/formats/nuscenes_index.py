@@ -67,80 +67,49 @@ NUSCENES = Dialect(("LIDAR_TOP",), CLASS_OF_CATEGORY.get)
 
 @dataclass(frozen=True)
 class Scenes:
-    """S scenes.
+    """S scenes."""
 
-    Attributes:
-        names: (S,) such as "scene-0103".
-        first_sample: (S + 1,) row of each scene's first sample.
-        first_image: (S + 1,) row of each scene's first image.
-    """
-
-    names: NDArray[np.str_]
-    first_sample: Ints
-    first_image: Ints
+    names: NDArray[np.str_]  # (S,) such as "scene-0103"
+    first_sample: Ints  # (S + 1,) row of each scene's first sample
+    first_image: Ints  # (S + 1,) row of each scene's first image
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """K calibrated sensors.
+    """K calibrated sensors."""
 
-    Attributes:
-        channels: (K,) such as "CAM_FRONT".
-        translations, quaternions: (K, 3) metres and (K, 4) w, x, y, z of ego_from_sensor.
-        intrinsics: (K, 3, 3) pixels; NaN for other sensors than cameras.
-        distortions: (K, 8) Brown-Conrady coefficients k1 k2 p1 p2 k3 k4 k5 k6; 0 without distortion.
-    """
-
-    channels: NDArray[np.str_]
-    translations: Array
-    quaternions: Array
-    intrinsics: Array
-    distortions: Array
+    channels: NDArray[np.str_]  # (K,) such as "CAM_FRONT"
+    translations: Array  # (K, 3) of ego_from_sensor, metres
+    quaternions: Array  # (K, 4) of ego_from_sensor, w, x, y, z
+    intrinsics: Array  # (K, 3, 3) pixels; NaN for other sensors than cameras
+    distortions: Array  # (K, 8) Brown-Conrady coefficients k1 k2 p1 p2 k3 k4 k5 k6; 0 without distortion
 
 
 @dataclass(frozen=True)
 class Samples:
-    """N samples, nuScenes' word for keyframes.
+    """N samples, nuScenes' word for keyframes."""
 
-    Attributes:
-        tokens: (N,) nuScenes' identifiers.
-        times_us: (N,) microseconds.
-        translations, quaternions: (N, 3) metres and (N, 4) w, x, y, z of world_from_ego at the time of LIDAR_TOP,
-            or of the nearest image where there is none.
-        lidars: (N,) row of the sample's LIDAR_TOP in Sensors, -1 where there is none.
-        first_annotation: (N + 1,) row of each sample's first annotation.
-    """
-
-    tokens: NDArray[np.bytes_]
-    times_us: Ints
-    translations: Array
-    quaternions: Array
-    lidars: Ints
-    first_annotation: Ints
+    tokens: NDArray[np.bytes_]  # (N,) nuScenes' identifiers
+    times_us: Ints  # (N,) microseconds
+    # of world_from_ego at the time of LIDAR_TOP, or of the nearest image where there is none
+    translations: Array  # (N, 3) metres
+    quaternions: Array  # (N, 4) w, x, y, z
+    lidars: Ints  # (N,) row of the sample's LIDAR_TOP in Sensors, -1 where there is none
+    first_annotation: Ints  # (N + 1,) row of each sample's first annotation
 
 
 @dataclass(frozen=True)
 class Images:
-    """P camera images, those of keyframes and those between, by time within each scene.
+    """P camera images, those of keyframes and those between, by time within each scene."""
 
-    Attributes:
-        samples: (P,) row in Samples.
-        sensors: (P,) row in Sensors.
-        times_us: (P,) microseconds.
-        keys: (P,) bool, whether the image belongs to a keyframe.
-        sizes: (P, 2) width and height, pixels.
-        translations, quaternions: (P, 3) metres and (P, 4) w, x, y, z of world_from_ego at the image's time.
-        files: (P,) paths relative to the dataset root.
-    """
-
-    samples: Ints
-    sensors: Ints
-    times_us: Ints
-    keys: NDArray[np.bool_]
-    sizes: Ints
-    translations: Array
-    quaternions: Array
-    files: NDArray[np.bytes_]
+    samples: Ints  # (P,) row in Samples
+    sensors: Ints  # (P,) row in Sensors
+    times_us: Ints  # (P,) microseconds
+    keys: NDArray[np.bool_]  # (P,) whether the image belongs to a keyframe
+    sizes: Ints  # (P, 2) width and height, pixels
+    translations: Array  # (P, 3) of world_from_ego at the image's time, metres
+    quaternions: Array  # (P, 4) of world_from_ego, w, x, y, z
+    files: NDArray[np.bytes_]  # (P,) paths relative to the dataset root
 
 
 @dataclass(frozen=True)
