@@ -68,11 +68,11 @@ class RigReading(Reading):
 
 @dataclass(frozen=True)
 class PoseReading(Reading):
-    """T poses world_from_ego, or those of a camera."""
+    """T poses, with the axes that it states; all readings share the arrays of the file."""
 
     translations: Array  # (T, 3) metres
     quaternions: Array  # (T, 4) w, x, y, z, norm 1
-    camera: str = ""  # whose poses they are, with optical axes; "" for the vehicle
+    camera: str = ""  # whose poses they are; "" for the vehicle
     note: str = ""  # how the file was read, in words
 
 

@@ -1,10 +1,12 @@
 """Readings of a file of poses: which body they are of, and in which direction. A vehicle drives along its x axis."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from itertools import product as combined
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from bevcli.geometry.transforms import Array, Pose, inverse, rigid
 from bevcli.sequences.files.readings import (
@@ -24,7 +26,6 @@ ASIDE = np.radians(25.0)  # largest angle between x and the direction of motion,
 LEVEL = 0.9  # cosine of the largest tilt of a vehicle in a world with z up
 VEHICLE_AXES = ("flu", "frd", "rfu")
 OTHER_AXES = [axes for axes in ALL_AXES if axes not in VEHICLE_AXES and not is_left_handed(axes)] + list(LEFT_HANDED)
-MOST_ROWS = 100_000  # of a file of which unusual readings are made: each takes as much memory as the poses
 OPPOSITE = dict(zip("fblrud", "bfrldu", strict=True))
 
 
@@ -53,32 +54,65 @@ def of_bodies(
         if transform == "body_from_world":
             quaternions = conjugate(quaternions)
             at = -rotated(quaternions, positions)
-        made: dict[tuple[bool, str], tuple[Array, Array]] = {}  # which all cameras share
+        steps = BodySteps.of(at[rows], quaternions[rows], times_ns[rows])
         for body, axes in ((body, axes) for body, each in axes_of.items() for axes in each):
             states = {"pose_angles": angles, "pose_transform": transform, "pose_axes": axes, "poses_of": body}
             is_vehicle = body == "vehicle"
-            rank = int(axes not in (VEHICLE_AXES if is_vehicle else ("rdf",)) and "pose_axes" not in wanted)
-            if not wanted.items() <= states.items() or (rank and len(at) > MOST_ROWS):
+            known = np.eye(4) if is_vehicle else cameras[body]
+            if not wanted.items() <= states.items() or (
+                known is not None and not steps.lead_along_x(known @ rigid(rotation=_turn(axes, is_vehicle=is_vehicle)))
+            ):
                 continue
-            known = None if is_vehicle else cameras[body]
-            if is_vehicle or known is not None:
-                few = _with_axes(at[rows], quaternions[rows], axes, is_vehicle=is_vehicle)
-                if not drives_along_x(*(few if known is None else of_ego(*few, known)), times_ns[rows]):
-                    continue
-            if (is_vehicle, axes) not in made:
-                made[is_vehicle, axes] = _with_axes(at, quaternions, axes, is_vehicle=is_vehicle)
-            yield PoseReading(states, *made[is_vehicle, axes], camera="" if is_vehicle else body, rank=rank)
+            rank = int(axes not in (VEHICLE_AXES if is_vehicle else ("rdf",)) and "pose_axes" not in wanted)
+            yield PoseReading(states, at, quaternions, camera="" if is_vehicle else body, rank=rank)
 
 
-def _with_axes(at: Array, quaternions: Array, axes: str, *, is_vehicle: bool) -> tuple[Array, Array]:
-    """Poses of a body with some axes as those of the vehicle, or of a camera with x right, y down, z forward."""
+def _turn(axes: str, *, is_vehicle: bool) -> Array:
+    """(3, 3) from a body with some axes to those of the vehicle, or of a camera with x right, y down, z forward."""
+    return ego_from_axes(axes) if is_vehicle else ego_from_axes("rdf").T @ ego_from_axes(axes)
+
+
+def in_usual_axes(reading: PoseReading, rows: slice = slice(None)) -> tuple[Array, Array]:
+    """Translations (T, 3) and quaternions (T, 4) of the vehicle, or of a camera with x right, y down, z forward."""
+    at, quaternions, axes = reading.translations[rows], reading.quaternions[rows], reading.states["pose_axes"]
     if is_left_handed(axes):  # the mirror image of a right-handed world
         at, quaternions = at * (1, -1, 1), quaternions * (1, -1, 1, -1)
         axes = axes[0] + OPPOSITE[axes[1]] + axes[2]
-    if is_vehicle:
+    if not reading.camera:
         return of_ego(at, quaternions, rigid(rotation=ego_from_axes(axes)))
-    turn = Pose.from_matrix(rigid(rotation=ego_from_axes(axes).T @ ego_from_axes("rdf"))).quaternion
+    turn = Pose.from_matrix(rigid(rotation=_turn(axes, is_vehicle=False).T)).quaternion
     return at, product(quaternions, turn[None])
+
+
+@dataclass(frozen=True)
+class BodySteps:
+    """The steps of a body on a vehicle, of which it is known by how much the body is turned in the world."""
+
+    moved: Array  # (T, 3) metres, in the frame of the body
+    turned: Array  # (T, 3, 3) body_from_next_body, minus the identity
+    seconds: Array  # (T,)
+
+    @classmethod
+    def of(cls, positions: Array, quaternions: Array, times_ns: NDArray[np.int64]) -> "BodySteps":
+        """Of poses world_from_body: (T, 3), (T, 4) w, x, y, z and their times (T,)."""
+        rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+        back = np.swapaxes(rotations[:-1], 1, 2)
+        moved = np.einsum("tij,tj->ti", back, np.diff(positions, axis=0))
+        return cls(moved, back @ rotations[1:] - np.eye(3), np.diff(times_ns) / 1e9)
+
+    def lead_along_x(self, ego_from_body: Array) -> bool:
+        """False for a vehicle that moves aside, or faster than vehicles do; True for one that hardly moves.
+
+        ego_from_body: (4, 4), which may mirror.
+        """
+        steps = (self.moved + self.turned @ inverse(ego_from_body)[:3, 3]) @ ego_from_body[:3, :3].T
+        lengths = np.linalg.norm(steps, axis=1)
+        moving = lengths > MOVING_M_S * self.seconds
+        if lengths[moving].sum() < MOVING_M:
+            return True
+        aside = np.arctan2(np.linalg.norm(steps[moving, 1:], axis=1), np.abs(steps[moving, 0]))
+        speed = np.median(lengths[moving] / self.seconds[moving])
+        return bool(speed < FASTEST_M_S and np.median(aside) < ASIDE)
 
 
 def of_ego(translations: Array, quaternions: Array, ego_from_body: Array) -> tuple[Array, Array]:
@@ -110,21 +144,6 @@ def compared_rows(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """The indices of poses that are compared: shorter steps are noise."""
     period = float(np.median(np.diff(times_ns))) / 1e9 if len(times_ns) > 1 else STEP_S
     return np.arange(0, len(times_ns), max(1, round(STEP_S / period)))
-
-
-def drives_along_x(translations: Array, quaternions: Array, times_ns: NDArray[np.int64]) -> bool:
-    """False for a vehicle that moves aside, or faster than vehicles do; True for one that hardly moves.
-
-    times_ns: (T,) of `compared_rows`.
-    """
-    steps, durations = np.diff(translations, axis=0), np.diff(times_ns) / 1e9
-    lengths = np.linalg.norm(steps, axis=1)
-    moving = lengths > MOVING_M_S * durations
-    if lengths[moving].sum() < MOVING_M:
-        return True
-    in_ego = rotated(conjugate(quaternions[:-1][moving]), steps[moving])
-    aside = np.arctan2(np.linalg.norm(in_ego[:, 1:], axis=1), np.abs(in_ego[:, 0]))
-    return bool(np.median(lengths[moving] / durations[moving]) < FASTEST_M_S and np.median(aside) < ASIDE)
 
 
 def quaternions_of_angles(roll: Array, pitch: Array, yaw: Array) -> Array:

@@ -34,6 +34,7 @@ from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.pose_readings import (
     FASTEST_M_S,
     compared_rows,
+    in_usual_axes,
     of_bodies,
     of_ego,
     quaternions_of_angles,
@@ -108,15 +109,10 @@ def _kind(table: Table) -> str:
 
 def of_reading(reading: PoseReading, times_ns: NDArray[np.int64], rig: CameraRig) -> ReadPoses:
     """The poses of the vehicle with a rig, as a reading has them."""
-    poses = _poses_of_ego(reading, rig)
+    poses = in_usual_axes(reading)
+    poses = of_ego(*poses, rig[reading.camera].ego_from_camera) if reading.camera else poses
     kinematics = derive_kinematics(times_ns, *poses)
     return ReadPoses(EgoMotion(times_ns, *poses, *kinematics, velocities_are_stated=False), (reading.note,))
-
-
-def _poses_of_ego(reading: PoseReading, rig: CameraRig) -> tuple[Array, Array]:
-    """Translations (T, 3) and quaternions (T, 4) of the vehicle."""
-    poses = reading.translations, reading.quaternions
-    return of_ego(*poses, rig[reading.camera].ego_from_camera) if reading.camera else poses
 
 
 def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:

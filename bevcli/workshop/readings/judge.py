@@ -18,7 +18,7 @@ from bevcli.sequences.images import ListedDrive
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.calibrations import poses_in_words
 from bevcli.workshop.formats.camera_poses import on_both_sides
-from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
+from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S, in_usual_axes
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.readings.heights import height_above_road
@@ -332,14 +332,12 @@ def _tracks(poses: ReadPoses, times_ns: NDArray[np.int64]) -> dict[int, Poses]:
         return {0: Poses.of(motion)}
     ends = times_ns.min() - AROUND_NS, times_ns.max() + AROUND_NS
     rows = slice(*(motion.timestamps_ns.searchsorted(ends) + (-1, 1)).clip(0))
-    return {
-        index: Poses(
-            motion.timestamps_ns[rows],
-            Rotation.from_quat(np.roll(each.quaternions[rows], -1, axis=1)).as_matrix(),
-            each.translations[rows],
-        )
-        for index, each in enumerate(poses.readings)
-    }
+    tracks = {}
+    for index, reading in enumerate(poses.readings):
+        at, quaternions = in_usual_axes(reading, rows)
+        rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+        tracks[index] = Poses(motion.timestamps_ns[rows], rotations, at)
+    return tracks
 
 
 def _is_possible(way: Array, times_ns: NDArray[np.int64]) -> bool:
