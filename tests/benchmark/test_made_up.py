@@ -1,6 +1,5 @@
 """The benchmark's drive and weights resemble a real drive and a trained model in everything that affects times."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -18,14 +17,6 @@ def test_the_cameras_see_about_as_many_cells_as_nuscenes():
     hits = find_hits(project_pillars(prepared.image_from_bev, pillars, (480, 800), prepared.has_image))
     # 2812 in a real nuScenes frame, the first of the reference numbers.
     assert 0.95 * 2812 < sum(hits.hits_per_camera) < 1.05 * 2812
-
-
-def test_images_are_decoded_and_differ():
-    frame = MadeUpDrive(2).load(1)
-    images = [image.pixels_bgr for image in frame.images.values()]
-    assert {image.shape for image in images} == {(900, 1600, 3)}
-    assert all(image.std() > 20 for image in images)
-    assert np.abs(images[0].astype(int) - images[1]).mean() > 20
 
 
 def test_no_matrix_is_zero_and_every_call_gives_the_same_weights(mini_config):

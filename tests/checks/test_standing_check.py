@@ -1,6 +1,5 @@
 """Images that move are seen, on real and on rendered drives; those of a vehicle that stands in traffic are not."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,13 +93,6 @@ def test_a_real_vehicle_that_stands_is_not_said_to_move(shared):
     assert drive.ego_motion.velocities == pytest.approx(0, abs=0.1)
     frames = [drive.load(place) for place in range(len(drive.stamps))]
     assert warned_at([*frames, *frames[::-1], *frames]) is None
-
-
-def test_it_takes_less_than_50_ms_in_a_run(standing):
-    frames = standing * 3
-    start = time.process_time()
-    assert warned_at(frames) is None
-    assert time.process_time() - start < 0.1  # 27 frames, on a machine that may be busy
 
 
 @pytest.mark.parametrize("static", [("--static",), pytest.param(("--static", "--no-temporal"), marks=pytest.mark.slow)])

@@ -9,12 +9,9 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from bevcli.cli import bridge
-from bevcli.cli.bridge import Part, command
+from bevcli.cli.bridge import command
 from bevcli.cli.main import PlainCommand, app
-from bevcli.config import known_models
 from bevcli.errors import BevcliError
-from bevcli.inference import complete_model
 from bevcli.inference.load import Model, choose_device
 from bevcli.options import Option, named, option, options
 from bevcli.sequences.open import open_sequence
@@ -39,14 +36,8 @@ class ReadOptions:
     calibration: str | Path | None = option(default=None, help="A file.")
     track: bool = option(default=True, help="Track.", flag="--track/--no-track")
     strict: bool = option(default=False, help="Strict.", panel="Checks")
-    names: tuple[str, ...] = option(default=(), help="Names, in order of --rate.", repeatable=True)
+    names: tuple[str, ...] = option(default=(), help="Names.", flag="--names -n", repeatable=True)
     secret: int = option(default=3, help="Only Python has it.", hidden=True)
-
-
-@options()
-class FileOptions:
-    files: tuple[Path, ...] = option(default=(), help="Files.", flag="--file -f", repeatable=True)
-    force: bool = option(default=False, help="Overwrite.")
 
 
 def invoke(function, *arguments):
@@ -55,26 +46,17 @@ def invoke(function, *arguments):
     return CliRunner().invoke(app, arguments)
 
 
-def options_of(*arguments):
+def test_options_arrive_as_the_dataclass_or_have_their_defaults():
     got = []
 
     def read(source: ReadOptions, force: Annotated[bool, Option("Overwrite.")] = False) -> None:
         got.append((source, force))
 
-    done = invoke(read, *arguments)
-    assert done.exit_code == 0, done.output
-    return got[0]
-
-
-def test_options_arrive_as_the_dataclass():
-    given = ("--rate", "2", "--frames", "1:3", "--static", "--no-track", "--strict", "--names", "a", "--names", "b")
-    source, force = options_of(*given, "--calibration", "c.json", "--force")
-    assert force
-    assert source == ReadOptions(2.0, slice(1, 3), "static", Path("c.json"), False, True, ("a", "b"))
-
-
-def test_options_that_are_not_given_have_their_defaults():
-    assert options_of() == (ReadOptions(), False)
+    given = ["--rate", "2", "--frames", "1:3", "--static", "--no-track", "--strict", "--names", "a", "-n", "b"]
+    given += ["--calibration", "c.json", "--force"]
+    assert (invoke(read, *given).exit_code, invoke(read).exit_code) == (0, 0)
+    expected = ReadOptions(2.0, slice(1, 3), "static", Path("c.json"), False, True, ("a", "b"))
+    assert got == [(expected, True), (ReadOptions(), False)]
 
 
 @pytest.mark.parametrize(
@@ -96,58 +78,6 @@ def test_a_wrong_value_is_a_usage_error(arguments, message):
     assert arguments[0] in done.output
 
 
-def test_a_command_may_take_a_part_of_the_options():
-    def read(source: Annotated[ReadOptions, Part(only=("strict",))]) -> None:
-        assert source == ReadOptions(strict=True)
-
-    assert invoke(read, "--strict").exit_code == 0
-    assert invoke(read, "--rate", "2").exit_code == 2
-
-
-def test_options_of_all_formats_arrive_as_a_mapping(monkeypatch):
-    @options("Input")
-    class Other:
-        topic: str = option(default="t", help="A topic.")
-
-    monkeypatch.setattr(bridge, "formats", lambda: [ReadOptions, Other])
-
-    def read(values: Annotated[bridge.FormatValues, Part(without=("names",))]) -> None:
-        assert values["topic"] == "x"
-        assert values["rate_hz"] == 2
-        assert "names" not in values
-
-    assert invoke(read, "--topic", "x", "--rate", "2").exit_code == 0
-
-
-def test_help_groups_options_by_panel():
-    def read(source: ReadOptions) -> None:
-        pass
-
-    text = invoke(read, "--help").output
-    assert text.index("Input") < text.index("--rate") < text.index("Checks") < text.index("--strict")
-    assert "secret" not in text
-    assert "Names, in order of --rate." in text
-
-
-def test_a_repeated_option_has_a_short_spelling():
-    def read(file: FileOptions) -> None:
-        assert file == FileOptions((Path("a"), Path("b")))
-
-    assert invoke(read, "-f", "a", "--file", "b").exit_code == 0
-
-
-def test_a_required_option_that_is_missing_is_a_usage_error():
-    @options()
-    class Required:
-        places: tuple[int, ...] = option(help="Places.", repeatable=True)
-
-    def read(given: Required) -> None:
-        assert given.places == (3, 4)
-
-    assert invoke(read, "--places", "3", "--places", "4").exit_code == 0
-    assert invoke(read).exit_code == 2
-
-
 def test_the_docstring_of_a_class_has_the_help_texts():
     assert "\n    frames: Frame range.\n" in ReadOptions.__doc__
 
@@ -155,7 +85,7 @@ def test_the_docstring_of_a_class_has_the_help_texts():
 def test_a_text_names_an_option_as_both_spell_it():
     assert named(ReadOptions, "rate_hz") == "`rate_hz` (`--rate`)"
     assert named(ReadOptions, "track") == "`track` (`--track`)"
-    assert named(FileOptions, "files") == "`files` (`--file`)"
+    assert named(ReadOptions, "names") == "`names` (`--names`)"
 
 
 @pytest.mark.parametrize(
@@ -188,10 +118,6 @@ def test_static_takes_precedence_over_no_temporal(mini_model):
     assert static.for_model(model.config, temporal=False).ego_motion == "static"
     assert InputOptions().for_model(model.config, temporal=False).ego_motion == "optional"
     assert InputOptions().for_model(model.config).ego_motion == "required"
-
-
-def test_model_names_are_completed():
-    assert sorted(complete_model("")) == sorted({*known_models(), "tiny-fp16"})
 
 
 def test_a_shell_is_given_the_names_that_start_with_the_text():

@@ -1,6 +1,5 @@
 """`--help` of the program and of every command, as a terminal of 80 columns shows it."""
 
-import gc
 import subprocess
 import sys
 
@@ -8,7 +7,6 @@ import pytest
 from typer.testing import CliRunner
 
 from bevcli.cli import main
-from bevcli.parsing.documents import without_garbage_collection
 from bevcli.registry import entries
 
 COMMANDS = [name for name in entries("bevcli.commands") if name != "weights"] + ["weights inspect", "weights convert"]
@@ -70,12 +68,3 @@ def test_help_of_the_program_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == "[]"
-
-
-def test_collection_goes_on_after_imports_and_errors():
-    with without_garbage_collection():
-        assert not gc.isenabled()
-    assert gc.isenabled()
-    with pytest.raises(ImportError), without_garbage_collection():
-        raise ImportError
-    assert gc.isenabled()

@@ -2,8 +2,6 @@
 
 import contextlib
 import io
-import subprocess
-import sys
 
 import pytest
 
@@ -51,16 +49,6 @@ def test_a_terminal_gets_a_bar_with_messages_above_it(monkeypatch):
 def test_a_terminal_without_cursor_movement_gets_plain_lines(monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
     assert work(Terminal(), 2)[-1].startswith("2/2 frames, ")
-
-
-def test_rich_progress_is_imported_only_for_a_bar():
-    code = (
-        "import sys, bevcli.cli.progress as p\n"
-        "with p.Progress(1, 'frames') as progress: progress.advance()\n"
-        "print('rich.progress' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
 
 
 @pytest.mark.parametrize(("seconds", "words"), [(7.6, "8 s"), (125, "2 min 05 s"), (4320, "1 h 12 min")])

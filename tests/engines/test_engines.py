@@ -85,12 +85,6 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
     np.testing.assert_allclose(found[0, 1], np.full_like(pixels, 120), atol=tolerance, rtol=0)
 
 
-def test_the_class_of_the_model_decodes_the_outputs_of_a_file(small_file, monkeypatch):
-    exported, decoded = load_exported(small_file, "onnxruntime"), object()
-    monkeypatch.setattr(exported.kind, "decode", lambda model, outputs: (model, outputs, decoded))
-    assert exported.decode("outputs") == (exported, "outputs", decoded)
-
-
 @pytest.mark.parametrize("engine", ["onnxruntime", pytest.param("openvino", marks=pytest.mark.slow)])
 def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
     assert load_model(int8_file).precision == "int8"

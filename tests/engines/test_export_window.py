@@ -93,13 +93,6 @@ def test_a_file_documents_its_window_and_all_inputs_and_outputs(window_file, fra
     assert ({"previous_features", "image_features"} <= names) == (len(frames) > 1)
 
 
-def test_levels_of_image_features_follow_from_the_configuration(cropping_model):
-    model = cropping_model(0)
-    width, height = model.config.image.padded_size
-    features = model.image_features(torch.zeros(1, 1, 3, height, width), torch.zeros(1, dtype=torch.int64))
-    assert features.level_shapes == model.config.level_shapes
-
-
 @pytest.mark.slow
 def test_an_interrupted_run_of_a_file_is_resumed_with_its_window(window_file, tmp_path):
     model = load_model(window_file())

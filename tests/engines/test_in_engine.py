@@ -178,10 +178,6 @@ def test_options_that_exclude_each_other_are_one_line(options, message):
         load_model(**{"model": "demo", "untrained": True, "device": "cpu", **options})
 
 
-def test_the_device_may_be_a_device_of_torch():
-    assert load_model("demo", precision="int8", device=torch.device("cpu")).needs_export
-
-
 def test_int8_takes_the_first_engine_that_is_installed(monkeypatch):
     assert load_model("demo", precision="int8").engine == "openvino"
     monkeypatch.setattr(OpenVinoEngine, "packages", ("no_such_package",))

@@ -15,9 +15,8 @@ from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
 
 from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import descending_scores, match_greedily
 from bevcli.geometry.transforms import rigid, rotation_about_z
-from bevcli.workshop.scores.detection import DetectionConfig, DetectionScores, evaluate_detections, gather
+from bevcli.workshop.scores.detection import DetectionConfig, DetectionScores, evaluate_detections
 from bevcli.workshop.scores.evaluate import evaluate
 
 
@@ -35,69 +34,12 @@ def numbers(scores: DetectionScores) -> dict[str, float]:
     return found
 
 
-def test_average_precision_computed_by_hand() -> None:
-    # A false positive, then both cars. Precision 0, 1/2, 2/3 at recall 0, 1/2, 1, linear between them. Counted
-    # are recalls 0.11 to 1.00: the sum of (p - 0.1) is 0.01 + ... + 0.40 = 8.2 up to the half,
-    # and 50 * 0.4 + (0.01 + ... + 0.50) / 3 = 24.25 beyond; over 90 recalls, over 0.9.
-    scores = evaluate_detections([cars([40, 0, 20], [0.9, 0.8, 0.7])], [cars([0, 20])])
-    assert scores.overall.classes["car"].aps[2.0] == pytest.approx((8.2 + 24.25) / 90 / 0.9)
-
-
-def test_a_match_is_closer_than_the_matching_distance() -> None:
-    found = evaluate_detections([cars([1.5], [0.9])], [cars([0.0])]).overall.classes["car"].aps
-    assert found == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
-
-
-def test_the_highest_score_is_matched_first() -> None:
-    # The second prediction is nearer to the first car, but it is taken: it matches the other one, 1.9 m away.
-    truth = gather([cars([0.0, 2.0])], np.zeros((1, 2)))
-    predictions = gather([cars([0.4, 0.1], [0.9, 0.8])], np.zeros((1, 2)))
-    np.testing.assert_array_equal(match_greedily(truth, predictions, (2.0, 1.0)), [[0, 1], [0, -1]])
-
-
-def test_the_five_errors_computed_by_hand() -> None:
-    truth = replace(cars([0.0]), velocities=np.array([[3.0, 0.0]]))
-    found = replace(
-        cars([0.6], [0.9]),
-        centers=np.array([[0.6, 0.8, 5.0]]),  # 1 m away on the ground; height does not count
-        sizes_lwh=np.array([[2.0, 2.0, 1.5]]),  # half of the length: IoU 1/2
-        yaws=np.array([2 * np.pi - 0.3]),
-        velocities=np.array([[3.0, 2.0]]),
-        attributes=np.array(["vehicle.moving"]),
-    )
-    errors = evaluate_detections([found], [truth]).overall.classes["car"].errors
-    expected = {"trans_err": 1.0, "scale_err": 0.5, "orient_err": 0.3, "vel_err": 2.0, "attr_err": 1.0}
-    assert errors == pytest.approx(expected)
-
-
-def test_a_barrier_has_no_front() -> None:
-    truth, found = cars([0.0], class_name="barrier"), cars([0.0], [0.9], class_name="barrier")
-    turned = replace(found, yaws=np.array([np.pi - 0.2]))
-    assert evaluate_detections([turned], [truth]).overall.classes["barrier"].errors["orient_err"] == pytest.approx(0.2)
-    turned_car = replace(cars([0.0], [0.9]), yaws=np.array([np.pi - 0.2]))
-    errors = evaluate_detections([turned_car], [cars([0.0])]).overall.classes["car"].errors
-    assert errors["orient_err"] == pytest.approx(np.pi - 0.2)
-
-
 def test_perfect_predictions_score_one() -> None:
     truth = random_truth(1)
     scores = evaluate_detections(as_predictions(truth, 2), truth)
     assert scores.overall.mean_ap == pytest.approx(1)
     assert scores.overall.nd_score == pytest.approx(1)
     assert all(part.mean_recall == 1 for part in scores.by_visibility.values())
-
-
-def test_no_predictions_score_zero() -> None:
-    truth = random_truth(1)
-    scores = evaluate_detections([Boxes3D.empty()] * len(truth), truth)
-    assert scores.overall.prediction_count == 0
-    assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
-    assert set(scores.overall.errors.values()) == {1.0}
-
-
-def test_no_boxes_on_either_side_score_zero() -> None:
-    scores = evaluate_detections([Boxes3D.empty()], [Boxes3D.empty()])
-    assert (scores.overall.mean_ap, scores.overall.nd_score) == (0, 0)
 
 
 def test_the_order_of_boxes_and_frames_does_not_matter() -> None:
@@ -173,30 +115,6 @@ def test_recall_by_visibility_counts_at_two_metres() -> None:
     found = {low: (part.prediction_count, part.ground_truth_count) for (low, _), part in scores.by_visibility.items()}
     assert found == {0.0: (1, 2), 0.4: (0, 1), 0.6: (0, 0), 0.8: (1, 1)}
     assert evaluate_detections([cars([0], [0.9])], [cars([0])]).by_visibility == {}
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_matching_equals_a_plain_loop(seed: int) -> None:
-    truth = random_truth(seed, per_class=8)
-    predictions = as_predictions(truth, seed + 100, noise_m=1.5, false_per_frame=200)
-    ego = np.zeros((len(truth), 2))
-    true, found = gather(truth, ego), gather(predictions, ego)
-    true, found = true[true.boxes.classes == "car"], found[found.boxes.classes == "car"]
-    assert found.boxes.scores is not None
-    found = found[descending_scores(found.boxes.scores)]
-    for limit in (0.5, 2.0, 4.0):
-        taken: set[int] = set()
-        expected = []
-        for frame, center in zip(found.frames, found.boxes.centers, strict=True):
-            best, best_distance = -1, limit
-            for place in range(len(true)):
-                distance = float(np.linalg.norm(true.boxes.centers[place, :2] - center[:2]))
-                if true.frames[place] == frame and place not in taken and distance < best_distance:
-                    best, best_distance = place, distance
-            taken.add(best)
-            taken.discard(-1)
-            expected.append(best)
-        np.testing.assert_array_equal(match_greedily(true, found, (limit,))[0], expected)
 
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "detection_metrics.json").read_text())

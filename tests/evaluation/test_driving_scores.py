@@ -25,16 +25,10 @@ from bevcli.workshop.scores.evaluate import evaluate
 from bevcli.workshop.vad.driving_metrics import (
     MIN_SCORE,
     PlannedFrame,
-    PlanScores,
-    _Curve,
-    collisions,
     evaluate_lines,
     evaluate_motion,
     evaluate_plans,
-    hits,
     match,
-    occupancy,
-    similarity,
 )
 from bevcli.workshop.vad.plan import Plan, PlanWriter
 
@@ -195,15 +189,6 @@ def test_average_precision_of_lines_equals_vads(golden: dict[str, Any], name: st
     assert scores.mean_ap == pytest.approx(expected["mAP"], abs=1e-6)
 
 
-def test_similarities_of_lines_equal_vads(golden: dict[str, Any]) -> None:
-    sample, expected = golden["map"]["set_A"], golden["map"]["set_A"]["result"]["score_matrix"]["divider"][0]
-    found, true = (
-        [_Curve(np.array(v["pts"], dtype=float)) for v in sample[key][0]["vectors"] if v["type"] == 0]
-        for key in ("pred", "gt")
-    )
-    assert np.sort(similarity(found, true), axis=0) == pytest.approx(np.sort(expected, axis=0), abs=1e-6)
-
-
 def boxes_of(side: dict[str, Any], offsets: np.ndarray) -> Boxes3D:
     """Boxes whose futures are sums of offsets (N, M, T, 2), NaN where these are."""
     rows = np.array(side["boxes"], dtype=float)
@@ -253,37 +238,16 @@ def planned(sample: dict[str, Any]) -> PlannedFrame:
     return PlannedFrame(path, np.array(sample["ego_gt_offsets"], dtype=float).cumsum(0), steps)
 
 
-def test_steps_of_planned_paths_equal_vads(golden: dict[str, Any]) -> None:
-    for sample, expected in zip(golden["planning"]["samples"], golden["planning"]["per_sample"], strict=True):
-        frame = planned(sample)
-        covered = occupancy([boxes[boxes.classes != "barrier"] for boxes in frame.others])
-        runs = np.zeros_like(covered)
-        for step, row, first, last in expected["occupied"]:
-            runs[step, row, first : last + 1] = True
-        assert np.array_equal(covered, runs)
-        assert hits(frame.driven, covered).tolist() == [bool(x) for x in expected["gt_box_hits"]]
-        assert hits(frame.path, covered).tolist() == [bool(x) for x in expected["pred_box_hits"]]
-        found = collisions(frame.path, frame.driven, covered)
-        assert found.tolist() == [bool(x) for x in expected["box_collision_per_step"]]
-
-
-def plan_scores(golden: dict[str, Any]) -> PlanScores:
-    valid = [sample for sample in golden["planning"]["samples"] if sample["fut_valid_flag"]]
-    return evaluate_plans(map(planned, valid), 0.5)
-
-
-def test_planned_paths_in_vads_convention_equal_vads(golden: dict[str, Any]) -> None:
-    scores, expected = plan_scores(golden), golden["planning"]["vad_mean_over_valid_samples"]
+def test_planned_paths_equal_those_of_vad_and_uniad(golden: dict[str, Any]) -> None:
+    of_plans = golden["planning"]
+    scores = evaluate_plans([planned(sample) for sample in of_plans["samples"] if sample["fut_valid_flag"]], 0.5)
     for seconds in (1, 2, 3):
-        l2 = scores.averaged(scores.distances_m, seconds)
-        assert l2 == pytest.approx(expected[f"plan_L2_{seconds}s"], abs=1e-6)
-        rate = scores.averaged(scores.collisions, seconds)
-        assert rate == pytest.approx(expected[f"plan_obj_box_col_{seconds}s"], abs=1e-6)
-
-
-def test_planned_paths_in_uniads_convention_equal_uniads(golden: dict[str, Any]) -> None:
-    scores, expected = plan_scores(golden), golden["planning"]["uniad_mean_per_step_over_valid_samples"]
-    for step in range(6):
-        assert scores.at(scores.distances_m, 0.5 * (step + 1)) == pytest.approx(expected["L2"][step], abs=1e-6)
-        # These reference numbers are for vehicles and humans together.
-        assert scores.at(scores.collisions, 0.5 * (step + 1)) == pytest.approx(expected["obj_box_col"][step], abs=1e-6)
+        expected = [
+            of_plans["vad_mean_over_valid_samples"][f"plan_{name}_{seconds}s"] for name in ("L2", "obj_box_col")
+        ]
+        found = [scores.averaged(values, seconds) for values in (scores.distances_m, scores.collisions)]
+        assert found == pytest.approx(expected, abs=1e-6)
+    # UniAD's reference numbers are for vehicles and humans together.
+    uniad, seconds = of_plans["uniad_mean_per_step_over_valid_samples"], [0.5 * (step + 1) for step in range(6)]
+    assert [scores.at(scores.distances_m, s) for s in seconds] == pytest.approx(uniad["L2"][:6], abs=1e-6)
+    assert [scores.at(scores.collisions, s) for s in seconds] == pytest.approx(uniad["obj_box_col"][:6], abs=1e-6)

@@ -76,16 +76,10 @@ def test_every_number_equals_the_devkits(golden: dict[str, Any], without: dict[s
             assert found == pytest.approx(number(value), abs=1e-9, nan_ok=True), (metric, name)
     for metric, value in expected["mean_metrics"].items():
         assert scores.overall[metric] == pytest.approx(number(value), abs=1e-9, nan_ok=True), metric
-
-
-def test_the_metrics_at_every_recall_level_equal_the_devkits(golden: dict[str, Any]) -> None:
-    scores = golden_scores(golden, {})
-    for name, metrics in golden["expected"]["per_threshold"].items():
+    for name, metrics in expected.get("per_threshold", {}).items():
         for metric, values in metrics.items():
-            expected = np.array([number(value) for value in values])
-            np.testing.assert_allclose(
-                scores.classes[name].levels[metric], expected, atol=1e-9, rtol=0, err_msg=f"{metric} of {name}"
-            )
+            levels = scores.classes[name].levels[metric]
+            np.testing.assert_allclose(levels, [*map(number, values)], atol=1e-9, rtol=0, err_msg=f"{metric} of {name}")
 
 
 def cars(rows: list[Row], score: float | None = None) -> Boxes3D:
@@ -122,50 +116,6 @@ def test_exchanged_identities_are_two_switches():
     assert found["amota"] == 35 / 40  # the scores of 18 matches reach 35 of the 40 recall levels
 
 
-def test_an_object_keeps_its_track_while_it_is_near():
-    found = metrics(car_scores(two_cars("sssssttttt", "tttttsssss", apart=1), two_cars(apart=1)))
-    assert (found["ids"], found["motp"], found["amota"]) == (0, 0.5, 1)
-
-
-def test_a_track_renamed_in_a_gap_is_fragmented_and_a_switch():
-    truth = [[("A", k, 0)] for k in range(10)]
-    predicted = [[("s", k, 0)] if k < 4 else [("t", k, 0)] if k >= 6 else [] for k in range(10)]
-    found = metrics(car_scores(predicted, truth))
-    assert (found["frag"], found["ids"], found["fn"], found["tp"]) == (1, 1, 2, 7)
-    assert found["lgd"] == 1.0  # two frames of half a second
-
-
-def test_a_gap_inside_a_track_is_interpolated():
-    truth = [[("A", k, 0)] for k in range(10)]
-    predicted = [[("s", k, 0)] if k not in (4,) else [] for k in range(10)]
-    found = metrics(car_scores(predicted, truth))
-    assert (found["frag"], found["fn"], found["amota"], found["motp"]) == (0, 0, 1, 0)
-
-
-def test_longer_gaps_are_interpolated_with_the_devkits_weights():
-    truth = [[("A", k, 0)] for k in range(4)]
-    predicted = [[("s", 0, 0)], [], [], [("s", 3, 0)]]
-    found = metrics(car_scores(predicted, truth))
-    assert found["motp"] == pytest.approx((0 + 1 + 1 + 0) / 4)  # at 2 m and 1 m in place of 1 m and 2 m
-
-
-def test_a_late_start_counts_the_seconds_before_the_first_match():
-    truth = [[("A", k, 0)] for k in range(10)]
-    predicted = [[("s", k, 0)] if k >= 3 else [] for k in range(10)]
-    found = metrics(car_scores(predicted, truth))
-    assert (found["tid"], found["lgd"], found["frag"], found["fn"]) == (1.5, 1.5, 0, 3)
-    assert (found["mt"], found["ml"]) == (0, 0)  # found in seven of ten frames
-
-
-def test_the_same_names_in_another_scene_are_other_objects():
-    truth = two_cars(frames=5) + two_cars(frames=5)
-    swapped = two_cars("s", "t", frames=5) + two_cars("t", "s", frames=5)
-    scores = car_scores(swapped, truth, scenes="aaaaabbbbb")
-    assert metrics(scores)["ids"] == 0
-    assert metrics(scores)["mt"] == 4
-    assert scores.scenes == 2
-
-
 def test_frames_may_come_in_any_order():
     truth, predicted = two_cars(), two_cars("sssssttttt", "tttttsssss")
     stamps = [FrameStamp(k, "a", k * 500_000_000) for k in range(10)]
@@ -182,13 +132,6 @@ def test_boxes_beyond_the_range_of_their_class_do_not_count():
     assert (found["gt"], found["fp"], found["amota"]) == (5, 0, 1)
 
 
-def test_as_many_pairs_as_possible_are_matched_even_if_farther():
-    truth = [[("A", 0, 0), ("B", 1.9, 0)]]
-    predicted = [[("s", 1.8, 0), ("t", 3.7, 0)]]  # s is nearest to B, but then t would be left over for nobody
-    found = metrics(car_scores(predicted, truth))
-    assert (found["tp"], found["fn"], found["motp"]) == (2, 0, pytest.approx(1.8))
-
-
 def test_predictions_without_an_identity_are_left_out():
     found = metrics(car_scores([[("s", 0, 0), ("", 20, 0)]] * 3, [[("A", 0, 0)]] * 3))
     assert (found["tp"], found["fp"]) == (3, 0)
@@ -198,11 +141,6 @@ def test_without_ground_truth_everything_is_nan():
     scores = car_scores([[("s", 0, 0)]], [[]])
     assert all(np.isnan(value) for value in metrics(scores).values())
     assert np.isnan(scores.overall["amota"])
-
-
-def test_without_predictions_a_class_gets_the_worst_values():
-    found = metrics(car_scores([[], []], [[("A", 0, 0)], [("A", 0, 0)]]))
-    assert (found["amota"], found["amotp"], found["ml"], found["fn"], found["tid"]) == (0, 2, 1, 2, 20)
 
 
 def test_one_identity_twice_in_a_frame_is_an_error():

@@ -85,8 +85,8 @@ def _serve(connection: Connection, seeds: Path, folder: Path, group: str | None,
     from readers import READERS
     from warm_python import WarmPython
 
-    from bevcli.recording import meshes
     from bevcli.viewer import recording_file
+    from bevcli.workshop import meshes
 
     recording_file.run_python = meshes.run_python = WarmPython()  # ends with this process, as its input does
     warnings.simplefilter("ignore")

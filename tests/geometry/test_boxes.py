@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import BevcliError
-from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 
 
@@ -30,14 +30,6 @@ def test_corners_of_a_box_by_hand():
     assert corners[0] == pytest.approx([9, 2, 0])  # front left, bottom: ahead is +y, left is -x
     assert corners[7] == pytest.approx([11, 2, 2])  # front right, top
     assert {tuple(np.round(c, 9)) for c in corners} == {(x, y, z) for x in (9, 11) for y in (-2, 2) for z in (0, 2)}
-
-
-def test_edges_have_the_lengths_of_the_sizes():
-    boxes = some_boxes()
-    lengths = [np.linalg.norm(boxes.corners()[:, a] - boxes.corners()[:, b], axis=1) for a, b in BOX_EDGES]
-    assert np.sort(np.stack(lengths, 1), axis=1) == pytest.approx(
-        np.sort(np.repeat(boxes.sizes_lwh, 4, axis=1), axis=1)
-    )
 
 
 def test_transforming_moves_corners_like_points_and_inverts():

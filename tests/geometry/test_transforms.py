@@ -16,8 +16,6 @@ from bevcli.geometry.transforms import (
     quaternion_from_rotation,
     rigid,
     rotation_from_quaternion,
-    wrap_angle,
-    yaw_of_quaternion,
 )
 
 RANDOM = np.random.default_rng(1)
@@ -44,12 +42,6 @@ def test_inverse_undoes_a_transform():
     assert inverse(np.stack([a_from_b, np.eye(4)]))[0] @ a_from_b == pytest.approx(np.eye(4))
 
 
-def test_yaw_counts_counter_clockwise_from_x():
-    half = np.radians(30) / 2
-    assert yaw_of_quaternion((np.cos(half), 0, 0, np.sin(half))) == pytest.approx(np.radians(30))
-    assert yaw_of_quaternion((-np.cos(half), 0, 0, -np.sin(half))) == pytest.approx(np.radians(30))
-
-
 def test_interpolation_takes_the_shorter_arc_and_the_first_sign():
     start = Pose(np.zeros(3), np.array([-np.cos(0.1), 0, 0, -np.sin(0.1)]))  # yaw 0.2, stored with w < 0
     end = Pose(np.array([2.0, 0, 0]), np.array([np.cos(0.3), 0, 0, np.sin(0.3)]))  # yaw 0.6
@@ -57,15 +49,6 @@ def test_interpolation_takes_the_shorter_arc_and_the_first_sign():
     assert middle.translation == pytest.approx([1, 0, 0])
     assert middle.yaw == pytest.approx(0.4)
     assert middle.quaternion[0] < 0
-
-
-def test_wrapped_angles_differ_by_whole_turns():
-    angles = np.linspace(-20, 20, 101)
-    wrapped = wrap_angle(angles)
-    assert (wrapped >= -np.pi).all()
-    assert (wrapped < np.pi).all()
-    assert np.cos(wrapped) == pytest.approx(np.cos(angles))
-    assert np.sin(wrapped) == pytest.approx(np.sin(angles))
 
 
 def test_cells_of_a_small_grid_by_hand():

@@ -10,10 +10,6 @@ from bevcli.inference.pipeline import read_ahead, write_behind
 from bevcli.inference.runner import AHEAD_BYTES, frames_ahead
 
 
-def test_everything_comes_in_order():
-    assert list(read_ahead(lambda x: x * x, range(10))) == [x * x for x in range(10)]
-
-
 def test_several_threads_keep_the_order():
     late = threading.Event()
 
@@ -65,13 +61,6 @@ def test_items_are_loaded_in_order_in_one_thread_of_their_own():
     assert threads.isdisjoint(thread for _, thread in results)
 
 
-def test_an_error_of_loading_is_raised_at_its_item():
-    results = read_ahead(lambda x: x, range(5), depth=4, threads=2, load=lambda x: 1 / (2 - x))
-    assert [next(results), next(results)] == [0.5, 1.0]
-    with pytest.raises(ZeroDivisionError):
-        next(results)
-
-
 @pytest.mark.parametrize("cameras", [1, 6, 60])
 def test_frames_ahead_of_a_gpu_are_bounded_by_their_memory(cameras):
     image = load_config("base").image
@@ -98,18 +87,6 @@ def test_items_are_made_while_the_first_one_is_written():
 
     assert all(write_behind(items(), lambda item: all_made.wait(5), depth=3))
     assert made == list(range(4))
-
-
-def test_no_more_items_are_made_than_may_wait():
-    made = []
-
-    def items():
-        for item in range(20):
-            made.append(item)
-            yield item
-
-    most = max(write_behind(items(), lambda item: len(made) - item, depth=2))
-    assert most <= 4  # the one worked on, two that wait, and one that was made meanwhile
 
 
 def test_what_was_made_is_written_where_the_caller_stops():

@@ -36,21 +36,6 @@ def test_images_equal_normalising_before_resizing(mini_config, order):
     np.testing.assert_allclose(images, np.stack(expected), rtol=0, atol=1e-5)
 
 
-def test_area_resizing_averages_pixels(mini_config):
-    """Stripes that are finer than the network's pixels become grey."""
-    config = replace(mini_config, image=replace(mini_config.image, resize="area"))
-    frame = MemoryDrive().load(1)
-    name = config.cameras[0]
-    stripes = np.zeros_like(frame.images[name].pixels_bgr)
-    stripes[:, ::2] = 200  # a network pixel covers two by two pixels
-    frame = replace(frame, images={**frame.images, name: replace(frame.images[name], pixels_bgr=stripes)})
-    image = Preprocessor(config)(frame).images[0, 0].numpy()
-    width, height = config.image.size
-    mean, std = (np.array(values)[:, None, None] for values in (config.image.mean, config.image.std))
-    expected = np.broadcast_to((100 - mean) / std, (3, height, width))
-    np.testing.assert_allclose(image[:, :height, :width], expected, rtol=0, atol=1e-4)
-
-
 def test_projection_uses_the_pose_at_each_cameras_time(mini_config):
     frame = MemoryDrive().load(1)
     late = Pose(frame.world_from_ego.translation + [1.5, 0, 0], frame.world_from_ego.quaternion)
@@ -76,14 +61,6 @@ def test_an_image_of_another_aspect_ratio_is_fitted_as_its_rig(mini_config):
     point_bev = apply(inverse(sequence.rig.ego_from_bev), [12.0, 1.0, 0.5])
     u, v, d, _ = prepared.image_from_bev[0, 0].numpy() @ [*point_bev, 1]
     assert (u / d, v / d) == pytest.approx(0.3 * expected, abs=1e-3)
-
-
-def test_images_of_different_sizes_form_one_batch(mini_config):
-    cameras = (make_camera("CAM_FRONT", 0, 320, 180), make_camera("CAM_BACK", 180, 640, 400))
-    sequence = MemoryDrive(rig=CameraRig(cameras, make_rig().ego_from_bev))
-    prepared = Preprocessor(mini_config)(sequence.load(0))
-    assert prepared.images.shape == (1, 2, 3, 96, 160)
-    assert prepared.scales == (0.5, 90 / 400)
 
 
 def test_images_are_undistorted_before_resizing(mini_config):
@@ -208,12 +185,6 @@ def test_it_equals_opencv_for_any_size(width, height, new_width, new_height, met
     expected = by_opencv(pixels, new_width, new_height, method)
     # OpenCV rounds positions in the image to float32.
     np.testing.assert_allclose(resized(pixels, new_width, new_height, method), expected, atol=1e-4)
-
-
-@pytest.mark.parametrize(("size", "method"), [((512, 288), "area"), ((800, 450), "linear"), ((1600, 900), "linear")])
-def test_it_equals_opencv_for_the_sizes_of_the_models(size, method):
-    pixels = np.random.default_rng(0).integers(0, 256, (900, 1600, 3), dtype=np.uint8)
-    np.testing.assert_allclose(resized(pixels, *size, method), by_opencv(pixels, *size, method), atol=5e-6)
 
 
 def test_channels_are_reversed_and_any_memory_layout_is_read():

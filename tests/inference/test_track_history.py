@@ -20,7 +20,6 @@ from bevcli.model.prepare import prepare_for_inference
 from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes
-from bevcli.workshop.training import validation
 from bevcli.workshop.uniad.map_head import MapHeadConfig
 from bevcli.workshop.uniad.uniad import TrackQueryConfig, UniAD, UniADConfig
 
@@ -78,19 +77,6 @@ def test_tracks_are_born_go_on_and_end(whole):
     assert found[0] - found[-1]
 
 
-def test_a_track_keeps_its_class_and_moves_little_in_the_world(whole):
-    def centers(prediction):
-        boxes = prediction.boxes_world
-        return {name: center for name, center in zip(boxes.instances, boxes.centers, strict=True) if name}
-
-    one, other = centers(whole[1]), centers(whole[2])
-    both = one.keys() & other.keys()
-    assert both
-    tracked = np.median([np.linalg.norm(one[name] - other[name]) for name in both])
-    any_two = np.median([np.linalg.norm(center - last) for center in one.values() for last in other.values()])
-    assert tracked < any_two
-
-
 def test_boxes_with_an_identity_have_their_score_as_track_score(whole):
     boxes = whole[2].boxes
     followed = boxes.instances != ""
@@ -98,11 +84,6 @@ def test_boxes_with_an_identity_have_their_score_as_track_score(whole):
     assert np.isnan(boxes.track_scores[~followed]).all()
     assert (boxes.scores[followed] >= 0.25).all()
     assert len(set(boxes.instances[followed])) == followed.sum()
-
-
-def test_a_prediction_has_the_map_of_the_models_classes(whole, config):
-    assert tuple(whole[0].segmentation.classes) == config.map_classes
-    assert whole[0].segmentation.cells.shape == (config.bev_grid.rows, config.bev_grid.columns)
 
 
 @pytest.mark.parametrize("cut", [pytest.param(1, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)])
@@ -149,12 +130,6 @@ def test_a_first_frame_sees_the_motion_since_the_scene_before(model):
     assert (with_motion[2].bev - without[2].bev).abs().max() > 1e-3
 
 
-def test_a_gap_in_time_starts_anew(model):
-    predictions, _ = run(model, MemoryDrive(2, step_s=2.5))
-    assert str(predictions[1].started_anew) == "gap of 2.5 s"
-    assert min(identities(predictions[1])) > max(identities(predictions[0]))
-
-
 def test_without_history_frames_stand_alone_without_identities(model):
     predictions, _ = run(model, MemoryDrive(3), temporal=False)
     assert {str(p.started_anew or "") for p in predictions} == {"history is off"}
@@ -189,11 +164,6 @@ def test_identities_go_on_after_a_frame_that_is_not_finite(model):
     assert min(identities(last)) > max(identities(first))
 
 
-def test_every_stage_is_timed(whole):
-    stages = ["backbone", "neck", "encoder", "decoder", "tracks", "map_head", "box_decoding", "map_merging"]
-    assert list(whole[1].stage_seconds) == stages
-
-
 @pytest.fixture
 def loaded(model) -> Model:
     return Model(model, tracker=TrackerConfig(birth_score=0.0, keep_score=0.0))
@@ -224,29 +194,3 @@ def test_an_interrupted_run_is_resumed_with_its_tracks(loaded, tmp_path):
     for name in ("predictions.json", "tracks.csv", "segmentation/000004.png", "segmentation/map.json"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     assert any((frame.boxes.instances != "").any() for frame in read_boxes(tmp_path / "whole/predictions.json").frames)
-
-
-class OneDrive(list):
-    def open(self, index):
-        return self[index]
-
-
-class Labelled(MemoryDrive):
-    """Its true boxes are the predicted ones."""
-
-    def __init__(self, predictions):
-        super().__init__(len(predictions))
-        self.predictions = predictions
-
-    def load(self, place):
-        return replace(super().load(place), ground_truth=self.predictions[place].boxes_world)
-
-
-def test_validation_scores_the_models_own_identities(model, whole, monkeypatch):
-    def keep(compared):
-        scored.extend(frame.boxes.instances.tolist() for frame in compared.pairs.predictions)
-
-    scored: list[list[str]] = []
-    monkeypatch.setattr(validation, "score_tracks", keep)
-    validation.score_drives(Runner(model, CPU, tracker=TrackerConfig()), OneDrive([Labelled(whole[:3])]))
-    assert scored == [prediction.boxes.instances.tolist() for prediction in whole[:3]]

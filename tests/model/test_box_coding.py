@@ -47,13 +47,6 @@ def test_decoding_undoes_encoding() -> None:
     assert decoded.classes.tolist() == ["car"] * 6
 
 
-def test_the_code_of_a_car_that_heads_along_y() -> None:
-    car = made_boxes([(1.0, 2, -1)], sizes_lwh=(4.5, 1.9, 1.6), yaws=np.pi / 2, velocities=(0.0, 8.0))
-    # The original's angle is -yaw - pi/2 = -pi: sine 0, cosine -1.
-    expected = [1, 2, np.log(1.9), np.log(4.5), -1, np.log(1.6), 0, -1, 0, 8]
-    np.testing.assert_allclose(encode(car)[0], expected, atol=1e-12)
-
-
 def test_unknown_velocities_are_nan_in_the_code() -> None:
     boxes = some_boxes(1)
     boxes.velocities[:] = np.nan

@@ -33,28 +33,6 @@ def test_sampling_equals_its_definition_as_loops() -> None:
     np.testing.assert_allclose(ours, _by_loops(values, locations, weights, map_of_query=[0, 0, 1, 1, 1]), atol=1e-5)
 
 
-def test_a_map_that_no_query_samples_changes_nothing() -> None:
-    values, locations, weights = torch.randn(3, 24, 2, 4), torch.rand(6, 2, 1, 2, 2), torch.rand(6, 2, 1, 2)
-    with_empty = sample(values, TWO_LEVELS[:1], locations, weights, [4, 0, 2])
-    without = sample(values[[0, 2]], TWO_LEVELS[:1], locations, weights, [4, 2])
-    assert torch.equal(with_empty, without)
-
-
-def test_samples_far_outside_the_map_are_zero() -> None:
-    locations = torch.full((1, 1, 1, 1, 2), 6.7e6)
-    assert torch.equal(
-        sample(torch.ones(1, 24, 1, 4), TWO_LEVELS[:1], locations, torch.ones(1, 1, 1, 1), [1]), torch.zeros(1, 4)
-    )
-
-
-def test_offsets_are_cells_of_their_own_level() -> None:
-    offsets = torch.ones(1, 2, 1, 2)
-    sizes = sample.level_sizes(TWO_LEVELS, offsets.device)
-    locations = sampling_locations(torch.full((1, 1, 1, 2), 0.5), offsets, sizes)
-    expected = [[0.5 + 1 / 6, 0.5 + 1 / 4], [0.5 + 1 / 3, 0.5 + 1 / 2]]
-    torch.testing.assert_close(locations[0, :, 0], torch.tensor(expected))
-
-
 @pytest.mark.parametrize("heads", [4, 8])
 def test_untrained_heads_sample_in_a_ring_with_equal_weights(heads: int) -> None:
     attention = DeformableAttention(16, 16, heads, points=3, levels=2)
@@ -258,14 +236,3 @@ def test_spatial_cross_attention_averages_cameras_seeing_a_cell() -> None:
     attended = block(torch.randn(1, 3, CHANNELS), FeatureMaps(tokens, ((3, 4),)), hits)[0]
     expected = torch.stack([tokens[0, 0], tokens[:, 0].mean(0), torch.zeros(CHANNELS)]) + bias
     torch.testing.assert_close(attended, expected, atol=1e-5, rtol=1e-5)
-
-
-def test_sampling_points_alternate_between_the_pillars_heights() -> None:
-    block = SpatialCrossAttention(CHANNELS, heads=1, points=4, levels=1, dropout=0.1).eval()
-    pass_through(block.attention)
-    with torch.no_grad():  # only point 2 has weight; it belongs to the first of two heights
-        block.attention.attention_weights.bias.copy_(torch.tensor([0.0, 0, 100, 0]))
-    tokens = torch.randn(1, 2, CHANNELS)  # one row of two cells
-    hits = PillarHits(torch.tensor([0]), torch.tensor([[[0.25, 0.5], [0.75, 0.5]]]), (1,), torch.tensor([1]))
-    attended = block(torch.zeros(1, 1, CHANNELS), FeatureMaps(tokens, ((1, 2),)), hits)
-    torch.testing.assert_close(attended[0], tokens[0, :1], atol=1e-5, rtol=1e-5)

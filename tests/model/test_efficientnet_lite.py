@@ -17,12 +17,11 @@ from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLite, EfficientNetLiteConfig
-from bevcli.model.fpn import FPN, FPNConfig
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.onednn import PackedConvolution, has_onednn, use_onednn
 from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.model.resnet import Bottleneck, ResNet, ResNetConfig
+from bevcli.model.resnet import ResNetConfig
 from bevcli.workshop.weights import model_file as parts
 
 ALL_STAGES = (1, 2, 3, 4, 5, 6, 7)
@@ -46,12 +45,6 @@ def test_maps_have_the_published_strides_and_channels() -> None:
     assert [tuple(x.shape[1:]) for x in maps] == shapes
     assert config.output_channels() == tuple(shape[0] for shape in shapes)
     assert config.output_strides() == tuple(64 // shape[1] for shape in shapes)
-
-
-def test_the_first_eleven_blocks_have_the_published_size() -> None:
-    backbone = EfficientNetLiteConfig().build()
-    assert sum(map(len, backbone.stages)) == 11
-    assert 0.70e6 < sum(parameter.numel() for parameter in backbone.parameters()) < 0.72e6
 
 
 @pytest.mark.parametrize(("variant", "size"), [(0, 96), (2, 130), (4, 75)])
@@ -123,48 +116,6 @@ def test_the_kind_of_a_backbone_is_read_and_written() -> None:
 def test_a_wrong_backbone_is_one_line(backbone: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         config_of_table(as_table(small_config()) | {"backbone": backbone}, "own.toml")
-
-
-@pytest.mark.parametrize("style", ["pytorch", "caffe"])
-def test_stages_halve_the_map_and_double_the_channels(style: str) -> None:
-    config = ResNetConfig((1, 1, 2, 1), style, (1, 2, 3, 4), deformable_stages=(3, 4), width=4)
-    maps = ResNet(config).eval()(torch.randn(2, 3, 64, 96))
-    assert [tuple(x.shape) for x in maps] == [(2, 16, 16, 24), (2, 32, 8, 12), (2, 64, 4, 6), (2, 128, 2, 3)]
-    assert config.output_channels() == (16, 32, 64, 128)
-
-
-@pytest.mark.parametrize(("style", "strided"), [("pytorch", "conv2"), ("caffe", "conv1")])
-def test_the_style_decides_which_convolution_has_the_stride(style: str, strided: str) -> None:
-    block = Bottleneck(16, 8, 2, style, deformable=False)
-    strides = {name: getattr(block, name).stride for name in ("conv1", "conv2")}
-    assert [name for name, stride in strides.items() if stride == (2, 2)] == [strided]
-
-
-def test_an_untrained_block_is_the_identity() -> None:
-    x = torch.rand(1, 32, 5, 5)
-    assert torch.equal(Bottleneck(32, 8, 1, "pytorch", deformable=False).eval()(x), x)
-
-
-def test_stages_after_the_last_output_stage_are_left_out() -> None:
-    config = ResNetConfig((1, 1, 1, 1), output_stages=(2,), width=4)
-    assert len(ResNet(config).stages) == 2
-
-
-def test_each_extra_level_halves_the_one_before() -> None:
-    neck = FPN((8, 16), 6, FPNConfig(levels=4))
-    maps = neck([torch.randn(1, 8, 10, 14), torch.randn(1, 16, 5, 7)])
-    assert [tuple(x.shape) for x in maps] == [(1, 6, 10, 14), (1, 6, 5, 7), (1, 6, 3, 4), (1, 6, 2, 2)]
-
-
-def test_context_flows_from_coarse_to_fine_only() -> None:
-    neck = FPN((4, 4), 4, FPNConfig(levels=2))
-    for convolution in neck.modules():
-        if isinstance(convolution, nn.Conv2d):
-            nn.init.dirac_(convolution.weight)
-    fine, coarse = torch.rand(1, 4, 4, 4), torch.rand(1, 4, 2, 2)
-    fine_out, coarse_out = neck([fine, coarse])
-    torch.testing.assert_close(coarse_out, coarse)
-    torch.testing.assert_close(fine_out, fine + coarse.repeat_interleave(2, -1).repeat_interleave(2, -2))
 
 
 PAGE = (Path(__file__).parents[2] / "docs/extend.md").read_text()

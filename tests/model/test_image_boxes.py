@@ -393,22 +393,3 @@ def test_a_nearer_box_hides_a_foot() -> None:
     hidden = hidden_feet(boxes, torch.ones(1, 1, 2))[0, 0]
     assert hidden[0] == pytest.approx(0.5 * (1 - 300 / (800 + 2400 - 300)))
     assert hidden[1] == 0
-
-
-@pytest.mark.slow
-def test_the_lift_is_exported(lift: Lift) -> None:
-    boxes = found([upright(camera(0), 14, 0, 1.75, 0.6)] * 3, "person")
-
-    class Exported(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.lift = lift
-
-        def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
-            *parts, matrices, sizes = inputs
-            return tuple(self.lift(ImageBoxes(*parts), matrices, sizes)[:2])
-
-    inputs = (*vars(boxes).values(), torch.tensor(camera(0)).float()[None, None], torch.tensor([[SIZE]]))
-    program = torch.export.export(Exported(), inputs)
-    for a, b in zip(program.module()(*inputs), Exported()(*inputs), strict=True):
-        torch.testing.assert_close(a, b)

@@ -5,25 +5,21 @@ import math
 import numpy as np
 import pytest
 import torch
-from small_model import small_config, small_inputs, small_model
+from small_model import small_inputs, small_model
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.segmentation import (
     MaskDecoderLayer,
     SegmentationConfig,
-    SegmentationHead,
     SegmentationOutputs,
     decode_map,
     map_layers,
 )
 from bevcli.workshop.uniad.map_head import (
-    FlatListAttention,
     MapHead,
     MapHeadConfig,
     MapOutputs,
     merge_map,
-    sine_position,
-    thing_scores,
 )
 
 SMALL = MapHeadConfig(
@@ -65,60 +61,6 @@ def test_a_query_is_selected_for_each_of_its_best_classes() -> None:
     torch.testing.assert_close(of_pairs, outputs.scores[0])
 
 
-def bilinear(values: np.ndarray, x: float, y: float) -> np.ndarray:
-    """A map (rows, columns, D) at x, y, 0 to 1; values outside are zero."""
-    rows, columns, _ = values.shape
-    column, row = x * columns - 0.5, y * rows - 0.5
-    found = np.zeros(values.shape[-1])
-    for r in (math.floor(row), math.floor(row) + 1):
-        for c in (math.floor(column), math.floor(column) + 1):
-            if 0 <= r < rows and 0 <= c < columns:
-                found += (1 - abs(row - r)) * (1 - abs(column - c)) * values[r, c]
-    return found
-
-
-@pytest.mark.parametrize("reference_size", [2, 4])
-@pytest.mark.parametrize("queries", [30, 8, 3])
-def test_attention_for_four_levels_reads_as_the_released_kernel(queries: int, reference_size: int) -> None:
-    """The kernel walks two flat arrays with the strides of one level; this loop does the same index arithmetic."""
-    heads, levels, points, channels, (rows, columns) = 4, 4, 2, 8, (5, 6)
-    torch.manual_seed(1)
-    attention = FlatListAttention(channels, channels, heads, points, levels)
-    with torch.no_grad():
-        for parameter in attention.parameters():
-            parameter.add_(torch.randn_like(parameter))
-    query, cells = torch.randn(1, queries, channels), torch.randn(1, rows * columns, channels)
-    reference = torch.rand(1, queries, reference_size)
-    found = attention.attend(query, reference, cells, ((rows, columns),))
-
-    offsets = attention.sampling_offsets(query[0]).view(queries, heads, levels, points, 2)
-    weights = attention.attention_weights(query[0]).view(queries, heads, levels * points).softmax(-1)
-    place = reference[0, :, None, None, None]
-    if reference_size == 2:
-        locations = place + offsets / torch.tensor([columns, rows])
-    else:
-        locations = place[..., :2] + offsets / points * place[..., 2:] * 0.5
-    values = attention.value_projection(cells[0]).view(rows, columns, heads, -1).detach().numpy()
-    flat_locations, flat_weights = locations.detach().numpy().ravel(), weights.detach().numpy().ravel()
-    sampled = np.zeros((queries, heads, channels // heads))
-    for n in range(queries):
-        for m in range(heads):
-            start = (n * heads + m) * 1 * points  # the number of levels in the list of maps is 1
-            for p in range(points):
-                x, y = flat_locations[2 * (start + p) : 2 * (start + p) + 2]
-                sampled[n, m] += flat_weights[start + p] * bilinear(values[:, :, m], x, y)
-    expected = attention.output_projection(torch.from_numpy(sampled.reshape(1, queries, -1)).float())
-    torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-5)
-
-
-def test_the_position_embedding_is_that_of_row_then_of_column() -> None:
-    position = sine_position(4, 3, 8).view(4, 3, 8)
-    y, x = (2.5 / 4) * 2 * math.pi, (0.5 / 3) * 2 * math.pi
-    expected = [math.sin(y), math.cos(y), math.sin(y / 100), math.cos(y / 100)]
-    expected += [math.sin(x), math.cos(x), math.sin(x / 100), math.cos(x / 100)]
-    assert position[2, 0].tolist() == pytest.approx(expected, abs=1e-5)
-
-
 def outputs_of(*things: tuple[int, float, list[float]], stuff: list[float] | None = None) -> MapOutputs:
     """Outputs on a grid of one row. things: class, class score and mask, by falling score."""
     labels, scores, masks = (torch.tensor([list(part)]) for part in zip(*things, strict=True))
@@ -134,12 +76,6 @@ def layers(outputs: MapOutputs, cells: int) -> list[list[list[int]]]:
 
 DIVIDER, CROSSING, CONTOUR = 0, 1, 2
 ON, OFF = 1.2, 0.4  # a cell belongs to a mask above 0.5
-
-
-def test_a_thing_score_falls_with_the_mean_of_its_mask() -> None:
-    masks = torch.tensor([[0.9, 0.7, 0.2], [0.0, 0.1, 0.2]])
-    scores = thing_scores(masks, torch.tensor([0.5, 0.5]), min_mask=0.5)
-    assert scores.tolist() == pytest.approx([0.5 * (1.6 / 3) ** 2, 0])  # the denominator is the number of cells plus 1
 
 
 def test_things_get_the_cells_that_better_things_leave() -> None:
@@ -222,11 +158,6 @@ def test_without_the_head_there_are_no_outputs_and_weights() -> None:
     assert not [key for key in model.state_dict() if "segmentation" in key]
 
 
-def test_locations_lie_on_the_map() -> None:
-    locations = SegmentationHead(SEGMENTATION, 32, (6, 8))(torch.randn(2, 48, 32), torch.randn(48, 32)).locations
-    assert ((locations >= 0) & (locations <= 1)).all()
-
-
 def test_a_mask_is_the_weighted_sum_of_attention_maps() -> None:
     layer = MaskDecoderLayer(channels=8, heads=2, feed_forward_width=8, dropout=0.0)
     with torch.no_grad():
@@ -289,8 +220,3 @@ def test_a_cell_may_have_several_classes() -> None:
     outputs = SegmentationOutputs(masks, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
     one = decode_map(outputs, SegmentationConfig(map_scale=1), BevGrid(1, 2))
     assert one.cells.tolist() == [[1 + 2 + 8, 1 + 8]]
-
-
-def test_heads_without_detection_are_an_error() -> None:
-    with pytest.raises(ValueError, match="heads must name"):
-        small_config(heads=("segmentation",))

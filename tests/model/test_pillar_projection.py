@@ -18,12 +18,6 @@ from bevcli.model.pillar_projection import PillarHits, PillarProjection, Pillars
 SIZE = (480, 800)
 
 
-def project(image_from_bev: np.ndarray, points: np.ndarray, image: bool = True) -> PillarProjection:
-    """One camera, one sequence; points (cells, Z, 3)."""
-    matrix = torch.from_numpy(image_from_bev).float()[None, None]
-    return project_pillars(matrix, torch.from_numpy(points).float(), SIZE, torch.tensor([[image]]))
-
-
 def test_pillars_of_a_real_rig_are_projected_as_by_opencv() -> None:
     config = load_config("tiny")
     pillars = config.bev_grid.pillars().reshape(-1, 4, 3)
@@ -48,25 +42,6 @@ def test_pillars_of_a_real_rig_are_projected_as_by_opencv() -> None:
         assert (visible != in_image).sum() <= 2  # points on the edge of an image
         both = visible & in_image
         np.testing.assert_allclose(ours.reference_points[0, i].numpy()[both] * (800, 480), pixels[both], atol=0.01)
-
-
-def test_a_point_behind_the_camera_is_not_visible() -> None:
-    image_from_bev = np.array([[400, 0, 400, 0], [0, 400, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    points = np.array([[[0, 0, 5.0]], [[0, 0, -5.0]], [[0, 0, 0.0]]])
-    assert project(image_from_bev, points).visible.flatten().tolist() == [True, False, False]
-
-
-def test_a_point_on_the_edge_of_the_image_is_not_visible() -> None:
-    image_from_bev = np.array([[400, 0, 0, 0], [0, 240, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    points = np.array([[[0, 1, 1.0]], [[2, 1, 1.0]], [[1, 2, 1.0]], [[1.999, 1.999, 1.0]]])
-    assert project(image_from_bev, points).visible.flatten().tolist() == [False, False, False, True]
-
-
-def test_a_cell_is_hit_when_any_point_of_its_pillar_is_visible() -> None:
-    image_from_bev = np.array([[400, 0, 400, 0], [0, 400, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-    points = np.array([[[0, 0, 5.0], [90, 0, 5.0]], [[90, 0, 5.0], [0, 0, -5.0]]])
-    assert project(image_from_bev, points).hit.flatten().tolist() == [True, False]
-    assert not project(image_from_bev, points, image=False).hit.any()
 
 
 def test_hits_list_every_visible_pair_of_camera_and_cell_once() -> None:

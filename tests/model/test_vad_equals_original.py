@@ -4,8 +4,6 @@ golden_vad.npz in tests/data holds a part of the original's numbers for the firs
 are in the folder golden/ of BEVCLI_SHARED.
 """
 
-import importlib
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -16,7 +14,7 @@ import numpy as np
 import original_reference as original
 import pytest
 import torch
-from vad_rule import rule_vad, vad_shapes, vad_tensor
+from vad_rule import rule_vad, vad_shapes
 
 from bevcli.checkpoints import expected_state, from_official
 from bevcli.config import load_config
@@ -141,19 +139,6 @@ def test_the_released_files_keys_are_those_of_the_model() -> None:
     assert left_out == "pts_bbox_head.map_code_weights"
     expected = expected_state(load_config("vad-tiny"))
     assert {key: x.shape for key, x in found.items()} == {key: x.shape for key, x in expected.items()}
-
-
-def test_the_weights_follow_the_rule_of_the_goldens(shared: Path) -> None:
-    sys.path.insert(0, str(shared / "golden"))
-    try:
-        rule = importlib.import_module("rule_vad")
-    finally:
-        sys.path.pop(0)
-    left_out = ("img_", "pts_bbox_head.bev_embedding", "pts_bbox_head.code_weights")
-    keys = [key for key in vad_shapes() if not key.startswith(left_out)]
-    for key in keys[::5]:
-        shape = vad_shapes()[key]
-        np.testing.assert_array_equal(vad_tensor(key, shape), rule.fill_vad(key, shape), err_msg=key)
 
 
 @pytest.mark.slow
