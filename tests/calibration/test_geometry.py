@@ -18,7 +18,6 @@ from bevcli.workshop.correspondence.residuals import (
     EpipolarResiduals,
     RoadResiduals,
     derivatives,
-    geometry_at,
     solve,
     spread,
     values,
@@ -86,18 +85,6 @@ def test_a_turned_camera_leaves_residuals_of_pixels(drive):
     residuals = points_of(views, SCENE)
     within_a = residuals.group == views.groups().index((0, 0, 0))
     assert 0.2 < np.abs(values(unknowns, residuals, x)[within_a]).mean() < 11
-
-
-def test_points_of_a_flat_road_leave_no_residual(drive):
-    views, unknowns = drive
-    rays_a, rays_b = rays_in(views, (0, 0, 0), ROAD)
-    road = RoadResiduals(
-        np.zeros(len(ROAD), dtype=int), rays_a, rays_b, np.tile(np.eye(3)[:2], (40, 1, 1)), rays_a[:, 0]
-    )
-    x = np.zeros(len(unknowns.deviations))
-    assert np.abs(values(unknowns, road, x)).max() < 1e-9
-    x[HEIGHT] = 0.05
-    assert np.abs(values(unknowns, road, x)).max() > 1e-3
 
 
 def test_derivatives_are_those_of_finite_differences(drive):
@@ -174,14 +161,6 @@ def test_a_drive_that_shows_no_road_keeps_what_is_stated(drive):
     solution = solve(unknowns, [(nothing, spread(unknowns, nothing, x, cameras))], x)
     assert not solution.x.any()
     assert not solution.information.any()
-
-
-def test_a_delay_moves_the_vehicle(drive):
-    _, unknowns = drive
-    x = np.zeros(len(unknowns.deviations))
-    x[6] = x[OF_CAMERA + 6] = 0.1
-    expected = inverse(pose_after(0.6)) @ pose_after(0.1)
-    assert np.allclose(geometry_at(unknowns, x).ego_b_from_ego_a[0], expected, atol=1e-3)
 
 
 def test_points_beside_a_turn_are_measured_from_its_arc():

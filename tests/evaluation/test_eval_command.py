@@ -30,6 +30,13 @@ def write_frames(path: Path, frames: list[Boxes3D], reference: str = "ego", pose
     return path
 
 
+def scored(folder: Path, found: list[Boxes3D], truth: list[Boxes3D]) -> dict[str, Any]:
+    """The scores of files of boxes in the ego frame, whose poses are known."""
+    sides = {"found": found, "truth": truth}
+    files = (write_frames(folder / f"{name}.json", boxes, pose=Pose.identity()) for name, boxes in sides.items())
+    return evaluated(*files)
+
+
 def evaluated(*arguments: Path | str) -> dict[str, Any]:
     result = CliRunner().invoke(app, ["eval", *map(str, arguments), "--json"], catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -61,9 +68,8 @@ def test_the_json_has_the_devkits_keys(files: tuple[Path, Path]) -> None:
     assert len(scores["recall_by_visibility"]) == 4
 
 
-def test_predictions_without_a_box_score_zero_with_a_note(tmp_path: Path, files: tuple[Path, Path]) -> None:
-    empty = write_frames(tmp_path / "empty.json", [Boxes3D.empty()] * 3, pose=Pose.identity())
-    scores = evaluated(empty, files[1])
+def test_predictions_without_a_box_score_zero_with_a_note(tmp_path: Path) -> None:
+    scores = scored(tmp_path, [Boxes3D.empty()] * 3, random_truth(21, frames=3))
     assert (scores["mean_ap"], scores["nd_score"]) == (0, 0)
     assert any("the predictions contain no box" in note for note in scores["notes"])
 
@@ -90,11 +96,7 @@ def test_class_ranges_apply_only_with_an_ego_pose(tmp_path: Path) -> None:
 def test_absent_classes_and_attributes_are_noted(tmp_path: Path) -> None:
     truth = [boxes[boxes.classes == "car"] for boxes in random_truth(25)]
     truth = [replace(boxes, attributes=None) for boxes in truth]
-    found = as_predictions(truth, 26)
-    notes = evaluated(
-        write_frames(tmp_path / "p.json", found, pose=Pose.identity()),
-        write_frames(tmp_path / "g.json", truth, pose=Pose.identity()),
-    )["notes"]
+    notes = scored(tmp_path, as_predictions(truth, 26), truth)["notes"]
     assert any("no ground truth of truck" in note and "without them mAP 1.000, NDS 1.000" in note for note in notes)
     assert any("has no attributes" in note for note in notes)
 
@@ -103,24 +105,23 @@ def test_predictions_without_attributes_get_them_by_speed(tmp_path: Path) -> Non
     truth = [boxes[boxes.classes == "car"] for boxes in random_truth(27)]
     fast = [replace(boxes, velocities=np.full((len(boxes), 2), 3.0)) for boxes in truth]
     found = [replace(boxes, attributes=None) for boxes in as_predictions(fast, 28)]
-    scores = evaluated(
-        write_frames(tmp_path / "p.json", found, pose=Pose.identity()),
-        write_frames(tmp_path / "g.json", fast, pose=Pose.identity()),
-    )
-    assert scores["label_tp_errors"]["car"]["attr_err"] == 0
+    assert scored(tmp_path, found, fast)["label_tp_errors"]["car"]["attr_err"] == 0
+
+
+def scored_maps(folder: Path, of_run: int, of_drive: int, frames: int = 1, **classes: Any) -> dict[str, Any]:
+    """The scores of a run and a drive that have a map of one frame, each with one value in all cells."""
+    parts = {"predictions": ("segmentation", of_run), "ground_truth": ("ground_truth_map", of_drive)}
+    for name, (maps, value) in parts.items():
+        (folder / name).mkdir()
+        boxes = as_predictions(random_truth(29, frames=frames), 30)
+        write_frames(folder / name / f"{name}.json", boxes, pose=Pose.identity())
+        given = classes if name == "predictions" else {}
+        write_map(folder / name / maps, 0, BevMap(np.full((4, 4), value, np.uint8), (-2, 2), (-2, 2), **given))
+    return evaluated(*(folder / name for name in parts))
 
 
 def test_maps_next_to_the_files_are_scored(tmp_path: Path) -> None:
-    run, drive = tmp_path / "run", tmp_path / "drive"
-    for folder, name, maps, value in (
-        (run, "predictions", "segmentation", 1),
-        (drive, "ground_truth", "ground_truth_map", 9),
-    ):
-        folder.mkdir()
-        boxes = as_predictions(random_truth(29, frames=2), 30)
-        write_frames(folder / f"{name}.json", boxes, pose=Pose.identity())
-        write_map(folder / maps, 0, BevMap(np.full((4, 4), value, np.uint8), (-2, 2), (-2, 2)))
-    scores = evaluated(run, drive)
+    scores = scored_maps(tmp_path, 1, 9, frames=2)
     assert scores["iou"] == {
         "drivable_road": 1, "lane_boundary": None, "pedestrian_crossing": None, "vehicle": 0,
     }  # fmt: skip
@@ -142,21 +143,14 @@ def test_maps_next_to_the_files_are_scored(tmp_path: Path) -> None:
 def test_only_map_classes_of_both_sides_are_scored(
     tmp_path: Path, classes: dict[str, int], iou: dict[str, float] | None, note: str
 ) -> None:
-    run, drive = tmp_path / "run", tmp_path / "drive"
-    for folder, name in ((run, "predictions"), (drive, "ground_truth")):
-        folder.mkdir()
-        write_frames(folder / f"{name}.json", as_predictions(random_truth(29, frames=1), 30), pose=Pose.identity())
-    extent = ((-2, 2), (-2, 2))
-    write_map(run / "segmentation", 0, BevMap(np.full((4, 4), 2, np.uint8), *extent, classes))
-    write_map(drive / "ground_truth_map", 0, BevMap(np.full((4, 4), 4, np.uint8), *extent))
-    scores = evaluated(run, drive)
+    scores = scored_maps(tmp_path, 2, 4, classes=classes)
     assert scores["iou"] == iou
     assert any(note in text for text in scores["notes"])
 
 
 @pytest.mark.slow
 def test_plots_are_not_empty(tmp_path: Path, files: tuple[Path, Path]) -> None:
-    CliRunner().invoke(app, ["eval", *map(str, files), "--plot", str(tmp_path / "plots")], catch_exceptions=False)
+    evaluated(*files, "--plot", tmp_path / "plots")
     names = {"precision_recall.png", "errors_by_range.png", "misses_and_false_alarms.png"}
     assert {path.name for path in (tmp_path / "plots").iterdir()} == names
     for name in names:
@@ -251,9 +245,6 @@ def test_tracks_are_scored_when_asked_for(tracked_files: tuple[Path, Path]) -> N
     }  # fmt: skip
     assert (tracking["scenes"], tracking["frames"]) == (1, 5)
     assert tracking["recall"] == 1
-
-
-def test_the_tracking_table_names_every_metric(tracked_files: tuple[Path, Path]) -> None:
     result = CliRunner().invoke(app, ["eval", *map(str, tracked_files), "--tracking"], catch_exceptions=False)
     for name in ("AMOTA", "AMOTP", "MOTA", "IDS", "FRAG", "TID", "LGD", "identity switches"):
         assert name in result.stdout

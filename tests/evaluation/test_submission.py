@@ -26,6 +26,7 @@ ALLOWED_ATTRIBUTES = {
     "traffic_cone": {""},
 }
 VEHICLE_ATTRIBUTES = {"vehicle.moving", "vehicle.parked", "vehicle.stopped"}
+FURTHER_KEYS = {"detection": "attribute_name", "tracking": "tracking_id"}
 
 
 def many_boxes(count: int, seed: int = 0) -> Boxes3D:
@@ -42,49 +43,63 @@ def many_boxes(count: int, seed: int = 0) -> Boxes3D:
     )
 
 
-def assert_numbers(box: dict[str, Any]) -> None:
-    for key, length in (("translation", 3), ("size", 3), ("rotation", 4), ("velocity", 2)):
-        assert len(box[key]) == length
-        assert all(type(number) is float and math.isfinite(number) for number in box[key])
-
-
-def assert_valid(submission: dict[str, Any], tokens: set[str]) -> None:
+def assert_valid(submission: dict[str, Any], tokens: set[str], task: str = "detection") -> None:
     assert set(submission) == {"meta", "results"}
     flags = {"use_camera", "use_lidar", "use_radar", "use_map", "use_external"}
     assert set(submission["meta"]) == flags
     assert all(type(submission["meta"][flag]) is bool for flag in flags)
     assert set(submission["results"]) == tokens
+    numbers, further = {"translation": 3, "size": 3, "rotation": 4, "velocity": 2}, FURTHER_KEYS[task]
     for token, boxes in submission["results"].items():
         assert len(boxes) <= 500
         for box in boxes:
+            assert set(box) == {"sample_token", *numbers, f"{task}_name", f"{task}_score", further}
             assert box["sample_token"] == token
-            assert_numbers(box)
-            assert box["detection_name"] in NUSCENES_CLASSES
-            assert type(box["detection_score"]) is float
-            allowed = ALLOWED_ATTRIBUTES.get(box["detection_name"], VEHICLE_ATTRIBUTES)
-            assert box["attribute_name"] in allowed
+            assert {key: len(box[key]) for key in numbers} == numbers
+            values = [number for key in numbers for number in box[key]] + [box[f"{task}_score"]]
+            assert all(type(number) is float and math.isfinite(number) for number in values)
+            name = box[f"{task}_name"]
+            if task == "detection":
+                assert name in NUSCENES_CLASSES
+                assert box[further] in ALLOWED_ATTRIBUTES.get(name, VEHICLE_ATTRIBUTES)
+            else:
+                assert name in {"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"}
+                assert type(box[further]) is str
+
+
+def tracked_boxes(count: int, seed: int) -> Boxes3D:
+    boxes = many_boxes(count, seed)
+    instances = np.array([str(k) if k % 4 else "" for k in range(count)])
+    scores = np.where(instances == "", np.nan, np.random.default_rng(seed).uniform(0, 1, count))
+    return replace(boxes, instances=instances, track_scores=scores)
 
 
 def frame(index: int, boxes: Boxes3D, **extras: Any) -> FrameBoxes:
     return FrameBoxes(FrameStamp(index, "s", index), Pose.identity(), boxes, extras)
 
 
-def test_the_devkits_rules_are_followed(tmp_path: Path) -> None:
-    boxes = many_boxes(620)
+@pytest.mark.parametrize("task", FURTHER_KEYS)
+def test_the_devkits_rules_are_followed(tmp_path: Path, task: str) -> None:
+    boxes = many_boxes(620) if task == "detection" else tracked_boxes(1200, 1)
     rows = (
         frame(0, boxes, sample_token="t0"),
-        frame(1, many_boxes(1)),  # between keyframes: no token
+        frame(1, boxes[:8]),  # between keyframes: no token
         frame(2, Boxes3D.empty(), sample_token="t2"),
     )
-    write_submission(BoxesFile("world", rows), tmp_path / "results_nusc.json")
-    submission = json.loads((tmp_path / "results_nusc.json").read_text())
-    assert_valid(submission, {"t0", "t2"})
+    write_submission(BoxesFile("world", rows), tmp_path / "nusc.json", tracking=task == "tracking")
+    submission = json.loads((tmp_path / "nusc.json").read_text())
+    assert_valid(submission, {"t0", "t2"}, task)
     assert submission["meta"]["use_camera"] is True
     written = submission["results"]["t0"]
+    assert len(written) == 500
+    found = [box[f"{task}_score"] for box in written]
+    assert found == sorted(found, reverse=True)
+    if task == "tracking":
+        assert len({box["tracking_id"] for box in written}) == 500
+        return
     assert boxes.scores is not None
-    best = np.sort(boxes.scores)[::-1][:500]
-    np.testing.assert_array_equal([box["detection_score"] for box in written], best)
     first = int(np.argmax(boxes.scores))
+    np.testing.assert_array_equal(found, np.sort(boxes.scores)[::-1][:500])
     assert written[0]["translation"] == boxes.centers[first].tolist()
     assert written[0]["size"] == boxes.sizes_lwh[first][[1, 0, 2]].tolist()  # width, length, height
     assert yaw_of_quaternion(written[0]["rotation"]) == pytest.approx(boxes.yaws[first])
@@ -119,20 +134,23 @@ def test_attributes_follow_from_class_and_speed(class_name: str, slow: str, fast
     assert attributes_by_speed(boxes).tolist() == [slow, fast, slow]
 
 
-def test_a_submission_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "results_nusc.json"
-    boxes = many_boxes(20)
-    write_submission(BoxesFile("world", (frame(0, boxes, sample_token="t0"),)), path)
+@pytest.mark.parametrize("tracking", [False, True])
+def test_a_submission_is_read_back(tmp_path: Path, tracking: bool) -> None:
+    path, boxes = tmp_path / "nusc.json", many_boxes(20)
+    if tracking:
+        boxes = tracked_boxes(40, 3)
+        boxes = boxes[(boxes.instances != "") & (boxes.classes == "car")]
+    write_submission(BoxesFile("world", (frame(0, boxes, sample_token="t0"),)), path, tracking=tracking)
     assert is_submission(path)
-    found = read_submission(path)
-    assert found.frame_of_reference == "world"
-    assert found.frames[0].extras["sample_token"] == "t0"
-    assert boxes.scores is not None
-    best_first = boxes[np.argsort(-boxes.scores)]
-    np.testing.assert_allclose(found.frames[0].boxes.centers, best_first.centers)
-    np.testing.assert_allclose(found.frames[0].boxes.sizes_lwh, best_first.sizes_lwh)
-    np.testing.assert_allclose(found.frames[0].boxes.yaws, best_first.yaws)
-    assert found.frames[0].boxes.classes.tolist() == best_first.classes.tolist()
+    file = read_submission(path)
+    found = file.frames[0].boxes
+    assert (file.frame_of_reference, file.frames[0].extras["sample_token"]) == ("world", "t0")
+    scores = "track_scores" if tracking else "scores"
+    best_first = boxes[np.argsort(-getattr(boxes, scores))]
+    for name in (scores, "centers", "sizes_lwh", "yaws"):
+        np.testing.assert_allclose(getattr(found, name), getattr(best_first, name), err_msg=name)
+    assert found.classes.tolist() == best_first.classes.tolist()
+    assert not tracking or found.instances.tolist() == best_first.instances.tolist()
 
 
 @pytest.mark.parametrize(
@@ -160,52 +178,6 @@ def test_boxes_without_sample_token_or_world_frame_are_refused(tmp_path: Path) -
     with pytest.raises(InputError, match="these are in the ego frame"):
         write_submission(BoxesFile("ego", (frame(0, many_boxes(1), sample_token="t"),)), tmp_path / "a.json")
     assert not (tmp_path / "a.json").exists()
-
-
-def tracked_boxes(count: int, seed: int) -> Boxes3D:
-    boxes = many_boxes(count, seed)
-    instances = np.array([str(k) if k % 4 else "" for k in range(count)])
-    scores = np.where(instances == "", np.nan, np.random.default_rng(seed).uniform(0, 1, count))
-    return replace(boxes, instances=instances, track_scores=scores)
-
-
-def test_a_tracking_submission_keeps_the_devkits_rules(tmp_path: Path) -> None:
-    rows = (
-        frame(0, tracked_boxes(1200, 1), sample_token="t0"),
-        frame(1, tracked_boxes(8, 2)),  # between keyframes: no token
-        frame(2, Boxes3D.empty(), sample_token="t2"),
-    )
-    path = tmp_path / "tracking_nusc.json"
-    write_submission(BoxesFile("world", rows), path, tracking=True)
-    submission = json.loads(path.read_text())
-    assert set(submission) == {"meta", "results"}
-    assert set(submission["results"]) == {"t0", "t2"}
-    written = submission["results"]["t0"]
-    assert len(written) == 500
-    keys = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "tracking_name"}
-    for box in written:
-        assert set(box) == keys | {"tracking_score"}
-        assert type(box["tracking_id"]) is str
-        assert type(box["tracking_score"]) is float
-        assert box["tracking_name"] in {"bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"}
-        assert_numbers(box)
-    scores = [box["tracking_score"] for box in written]
-    assert scores == sorted(scores, reverse=True)
-    assert len({box["tracking_id"] for box in written}) == 500
-
-
-def test_a_tracking_submission_is_read_back(tmp_path: Path) -> None:
-    boxes = tracked_boxes(40, 3)
-    boxes = boxes[(boxes.instances != "") & (boxes.classes == "car")]
-    path = tmp_path / "tracking_nusc.json"
-    write_submission(BoxesFile("world", (frame(0, boxes, sample_token="t"),)), path, tracking=True)
-    assert is_submission(path)
-    read = read_submission(path).frames[0].boxes
-    assert boxes.track_scores is not None
-    order = np.argsort(-boxes.track_scores)
-    assert list(read.instances) == list(boxes.instances[order])
-    assert read.track_scores == pytest.approx(boxes.track_scores[order])
-    assert read.centers == pytest.approx(boxes.centers[order])
 
 
 def test_a_tracking_submission_needs_tracks(tmp_path: Path) -> None:

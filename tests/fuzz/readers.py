@@ -22,26 +22,21 @@ class Reader:
     read: Callable[[Path], object]
 
 
-def _open(folder: Path, **options: object) -> None:
-    from bevcli.sequences.open import open_sequence
+def _drive(name: str = "drive", **options: object) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        from bevcli.sequences.open import open_sequence
 
-    sequence = open_sequence(folder, **options)
-    for place in range(min(3, len(sequence.stamps))):
-        sequence.load(place)
+        sequence = open_sequence(folder / name, **options)
+        for place in range(min(3, len(sequence.stamps))):
+            sequence.load(place)
 
-
-def _drive(folder: Path) -> None:
-    _open(folder / "drive")
+    return read
 
 
 def _unlisted(folder: Path) -> None:
     from bevcli.workshop.formats.unlisted import find_frames
 
     find_frames(folder / "drive", ("CAM_FRONT", "CAM_BACK"))
-
-
-def _videos(folder: Path) -> None:
-    _open(folder / "videos_drive", ego_motion="static")
 
 
 def _check(folder: Path) -> None:
@@ -71,22 +66,15 @@ def _model(folder: Path) -> None:
     expected_state(load_config(folder / "model.toml"))
 
 
-def _rig(name: str) -> Callable[[Path], None]:
+def _rig(name: str, **more: str) -> Callable[[Path], None]:
+    """more: other files of the rig, by the option that names them; without any, `name` is a calibration."""
+
     def read(folder: Path) -> None:
         from bevcli.sequences.files.calibration_file import draft_of
         from bevcli.sequences.options import RigOptions
 
-        draft_of(RigOptions(intrinsics=folder / "rig" / name, extrinsics=folder / "rig/extrinsics.json"))
-
-    return read
-
-
-def _other_rig(name: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        from bevcli.sequences.files.calibration_file import draft_of
-        from bevcli.sequences.options import RigOptions
-
-        draft_of(RigOptions(calibration=folder / "rig" / name), folder / "drive")
+        files = {"intrinsics" if more else "calibration": name, **more}
+        draft_of(RigOptions(**{key: folder / "rig" / file for key, file in files.items()}), folder / "drive")
 
     return read
 
@@ -140,18 +128,6 @@ def _vehicle(folder: Path) -> None:
     load_vehicle(folder / "vehicle.glb")
 
 
-def _nuscenes(folder: Path) -> None:
-    _open(folder / "nuscenes")
-
-
-def _other(name: str) -> Callable[[Path], None]:
-    return lambda folder: _open(folder / name)
-
-
-def _bag(name: str) -> Callable[[Path], None]:
-    return lambda folder: _open(folder / name)
-
-
 def _classes(folder: Path) -> None:
     from bevcli.sequences.files.boxes_file import read_class_map
 
@@ -173,20 +149,20 @@ def _submission(folder: Path) -> None:
 TABLES = ("scene", "sample", "sensor", "calibrated_sensor", "sample_data", "ego_pose", "sample_annotation", "instance")
 SMALL_TABLES = ("category", "attribute", "visibility")
 READERS = {
-    "calibration": Reader("drive/calibration.json", "json", _drive),
+    "calibration": Reader("drive/calibration.json", "json", _drive()),
     "calibration check": Reader("drive/calibration.json", "json", _check),
-    "frames": Reader("drive/frames.csv", "text", _drive),
-    "ego-motion": Reader("drive/ego_motion.csv", "text", _drive),
-    "ground truth": Reader("drive/ground_truth.json", "json", _drive),
+    "frames": Reader("drive/frames.csv", "text", _drive()),
+    "ego-motion": Reader("drive/ego_motion.csv", "text", _drive()),
+    "ground truth": Reader("drive/ground_truth.json", "json", _drive()),
     "map": Reader("drive/ground_truth_map/000000.png", "bytes", _maps),
     "map legend": Reader("drive/ground_truth_map/map.json", "json", _maps),
     "timing": Reader("drive/timing.toml", "text", _unlisted),
     "model": Reader("model.toml", "text", _model),
-    "Kalibr": Reader("rig/camchain.yaml", "text", _rig("camchain.yaml")),
-    "ROS": Reader("rig/camera_info.yaml", "text", _rig("camera_info.yaml")),
-    "extrinsics": Reader("rig/extrinsics.json", "json", _rig("camchain.yaml")),
+    "Kalibr": Reader("rig/camchain.yaml", "text", _rig("camchain.yaml", extrinsics="extrinsics.json")),
+    "ROS": Reader("rig/camera_info.yaml", "text", _rig("camera_info.yaml", extrinsics="extrinsics.json")),
+    "extrinsics": Reader("rig/extrinsics.json", "json", _rig("camchain.yaml", extrinsics="extrinsics.json")),
     **{
-        name: Reader(f"rig/{file}", kind, _other_rig(file.partition("/")[0]))
+        name: Reader(f"rig/{file}", kind, _rig(file.partition("/")[0]))
         for name, file, kind in (
             ("K, D and T", "named.yaml", "text"),
             ("K, D and T by number", "named.json", "json"),
@@ -197,18 +173,18 @@ READERS = {
             ("KITTI calibration", "kitti.txt", "text"),
         )
     },
-    "JPEG": Reader("drive/images/CAM_FRONT/0.jpg", "bytes", _drive),
-    "PNG": Reader("drive/images/CAM_BACK/1.png", "bytes", _drive),
-    "MP4": Reader("videos_drive/videos/CAM_FRONT.mp4", "bytes", _videos),
-    "AVI": Reader("videos_drive/videos/CAM_BACK.avi", "bytes", _videos),
+    "JPEG": Reader("drive/images/CAM_FRONT/0.jpg", "bytes", _drive()),
+    "PNG": Reader("drive/images/CAM_BACK/1.png", "bytes", _drive()),
+    "MP4": Reader("videos_drive/videos/CAM_FRONT.mp4", "bytes", _drive("videos_drive", ego_motion="static")),
+    "AVI": Reader("videos_drive/videos/CAM_BACK.avi", "bytes", _drive("videos_drive", ego_motion="static")),
     "pth": Reader("weights.pth", "bytes", _weights("weights.pth")),
     "old pth": Reader("old.pth", "bytes", _weights("old.pth")),
     "safetensors": Reader("weights.safetensors", "bytes", _weights("weights.safetensors")),
     "recording": Reader("recording.rrd", "bytes", _recording),
     "predictions": Reader("predictions.json", "json", _predictions),
     "class map": Reader("classes.toml", "text", _classes),
-    "MCAP": Reader("bag.mcap", "bytes", _bag("bag.mcap")),
-    "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _bag("rosbag2")),
+    "MCAP": Reader("bag.mcap", "bytes", _drive("bag.mcap")),
+    "rosbag2": Reader("rosbag2/rosbag2.db3", "bytes", _drive("rosbag2")),
     "submission": Reader("results_nusc.json", "json", _submission),
     "state": Reader("out/.bevcli/state.pt", "bytes", _state),
     "written files": Reader("out/.bevcli/written", "bytes", _state),
@@ -217,7 +193,7 @@ READERS = {
     "learning curve": Reader("loss.csv", "text", _checkpoint),
     "vehicle mesh": Reader("vehicle.glb", "bytes", _vehicle),
     **{
-        f"{name} {Path(file).stem}": Reader(f"{name}/{file}", kind, _other(name))
+        f"{name} {Path(file).stem}": Reader(f"{name}/{file}", kind, _drive(name))
         for name, file, kind in (
             ("dgp", "scene_s.json", "json"),
             ("dgp", "calibration/c.json", "json"),
@@ -226,9 +202,9 @@ READERS = {
             ("t4", "annotation/calibrated_sensor.json", "json"),
         )
     },
-    "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _nuscenes),
+    "CAN bus": Reader("nuscenes/can_bus/scene-0001_pose.json", "json", _drive("nuscenes")),
     **{
-        f"nuScenes {name}": Reader(f"nuscenes/v1.0-mini/{name}.json", "json", _nuscenes)
+        f"nuScenes {name}": Reader(f"nuscenes/v1.0-mini/{name}.json", "json", _drive("nuscenes"))
         for name in (*TABLES, *SMALL_TABLES)
     },
 }

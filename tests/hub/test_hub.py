@@ -110,10 +110,8 @@ def test_a_model_is_downloaded_once_then_used_from_the_cache(hub, versions, monk
 
 
 def test_fetch_looks_for_a_newer_version_and_a_commit_stays(hub, versions, tmp_path):
-    assert (
-        f"model hf:team/model, commit {FIRST[:12]} (main)\n"
-        in command(tmp_path, "weights", "fetch", "hf:team/model").stdout
-    )
+    fetched = command(tmp_path, "weights", "fetch", "hf:team/model").stdout
+    assert f"model hf:team/model, commit {FIRST[:12]} (main)\n" in fetched
     hub.commits[SECOND] = versions[1]
     assert same_weights(load_model("hf:team/model", fetch=True), versions[1]["model.safetensors"])
     assert same_weights(load_model("hf:team/model"), versions[1]["model.safetensors"])
@@ -235,29 +233,15 @@ def test_a_folder_of_ones_own_model_has_a_card(tmp_path):
     files = ["own/mini.toml", "own/packed", "--weights", "own/w.safetensors"]
     done = command(tmp_path, "weights", "pack", *files)
     assert "own/packed/config.json: already exists; choose another folder, or pass `force=True`" in done.stderr
-    stated = [
-        "--licence",
-        "Our own terms",
-        "--scores",
-        "scores.json",
-        "--scored-on",
-        "our drives",
-        "--datasets",
-        "ours, nuscenes",
-        "--force",
-    ]
-    done = command(tmp_path, "weights", "pack", *files, *stated)
+    stated = ["--licence", "Our own terms", "--scores", "scores.json", "--scored-on", "our drives"]
+    done = command(tmp_path, "weights", "pack", *files, *stated, "--datasets", "ours, nuscenes", "--force")
     assert done.stderr == ""
     assert "next: bevcli run SEQUENCE --model hf:./own/packed, and hf upload OWNER/NAME own/packed" in done.stdout
     _, front, text = (tmp_path / "own/packed/README.md").read_text().split("---\n", 2)
     front = yaml.safe_load(front)
     (result,) = front["model-index"][0]["results"]
-    assert (front["library_name"], front["datasets"], front["metrics"]) == (
-        "bevcli",
-        ["ours", "nuscenes"],
-        ["mAP", "NDS"],
-    )
-    assert result["dataset"] == {"type": "ours", "name": "our drives"}
+    assert (front["library_name"], front["datasets"]) == ("bevcli", ["ours", "nuscenes"])
+    assert (front["metrics"], result["dataset"]) == (["mAP", "NDS"], {"type": "ours", "name": "our drives"})
     assert result["metrics"] == [{"type": "mAP", "value": 0.25}, {"type": "NDS", "value": 0.5}]
     assert (front["license"], front["license_name"]) == ("other", "Our own terms")
     assert "| mAP | 0.250 |" in text
