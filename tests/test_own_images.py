@@ -54,30 +54,24 @@ def my_drive(tmp_path):
     return drive
 
 
-def opened(drive):
-    return open_sequence(drive, calibration=drive.parent / "cameras.yaml", ego_motion_file=drive.parent / "poses.csv")
-
-
-def test_the_note_of_the_page_is_what_is_said(my_drive):
+def test_the_note_of_the_page_is_said_and_the_conversion_follows_it(my_drive, tmp_path):
+    stated = {"calibration": tmp_path / "cameras.yaml", "ego_motion_file": tmp_path / "poses.csv"}
+    one = open_sequence(my_drive, **stated)
     shown = next(block for name, block in OWN_BLOCKS if "note: " in block)
     shown = " ".join(shown.split()).removeprefix("note: ").removesuffix(" …")
-    said = next(note for note in opened(my_drive).notes if note.startswith("frames.csv"))
+    said = next(note for note in one.notes if note.startswith("frames.csv"))
     within = re.compile(r"within \d+ ms")
     assert within.sub("", said).startswith(within.sub("", shown))
     assert int(within.search(said)[0].split()[1]) <= 8
-
-
-def test_the_converted_drive_has_what_was_understood(my_drive, tmp_path):
     done = command(tmp_path, *shlex.split(next(line for line in OWN_COMMANDS if "convert" in line))[1:])
     assert done.returncode == 0, done.stderr
-    one, other = opened(my_drive), open_sequence(tmp_path / "my_sequence")
+    other = open_sequence(tmp_path / "my_sequence")
     assert (tmp_path / "my_sequence/frames.csv").exists()
     assert [stamp.timestamp_ns for stamp in one.stamps] == [stamp.timestamp_ns for stamp in other.stamps]
     for place in (0, 7):
         a, b = one.load(place), other.load(place)
-        assert {name: i.timestamp_ns for name, i in a.images.items()} == {
-            n: i.timestamp_ns for n, i in b.images.items()
-        }
+        times = [{name: image.timestamp_ns for name, image in frame.images.items()} for frame in (a, b)]
+        assert times[0] == times[1]
         assert all(image.encoded == b.images[name].encoded for name, image in a.images.items())
     assert list(b.dropped) == ["back"]
 

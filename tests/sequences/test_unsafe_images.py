@@ -5,7 +5,6 @@ import os
 import resource
 import shutil
 import struct
-import time
 
 import cv2
 import numpy as np
@@ -42,13 +41,14 @@ def test_only_regular_files_are_images(drive, target, strict):
     else:
         path.symlink_to(target)
     sequence = open_sequence(drive, strict=strict, allow_outside=True)
-    began = time.monotonic()
     if strict:
         with pytest.raises(InputError, match="regular file"):
             sequence.load(1)
     else:
         assert "is not a regular file" in sequence.load(1).dropped["CAM_BACK"]
-    assert time.monotonic() - began < 2
+    with (drive / "images/CAM_BACK/0.png").open("ab") as file:
+        file.truncate(1 << 40)
+    assert "the file has" in open_sequence(drive).load(0).dropped["CAM_BACK"]
 
 
 @pytest.mark.parametrize("encoded", [jpeg_of_size(60_000, 60_000), png_of_size(60_000, 60_000)], ids=["jpeg", "png"])
@@ -62,13 +62,6 @@ def test_the_size_is_checked_before_decoding(drive, encoded, place):
     else:
         sequence.load(0)
         assert "is 60000x60000 (expected 64x36" in sequence.load(place).dropped["CAM_BACK"]
-
-
-def test_a_file_that_is_too_large_for_its_image_is_a_gap(drive):
-    path = drive / "images/CAM_BACK/0.png"
-    with path.open("ab") as file:
-        file.truncate(1 << 40)
-    assert "the file has" in open_sequence(drive).load(0).dropped["CAM_BACK"]
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -141,12 +134,10 @@ def test_images_outside_of_the_folder_need_allow_outside(drive, kind):
     with pytest.raises(InputError, match=r"leads out of the folder.*`allow_outside=True`"):
         open_sequence(drive).load(1)
     assert "CAM_BACK" in open_sequence(drive, allow_outside=True).load(1).images
-
-
-def test_dots_that_lead_back_into_the_folder_are_inside(drive):
-    table = drive / "frames.csv"
-    table.write_text(table.read_text().replace("images/CAM_BACK/1.png", "images/../images/CAM_BACK/1.png"))
-    assert "CAM_BACK" in open_sequence(drive).load(1).images
+    if kind == "dots":  # that lead back into the folder
+        table = drive / "frames.csv"
+        table.write_text(table.read_text().replace("../elsewhere.png", "images/../images/CAM_BACK/1.png"))
+        assert "CAM_BACK" in open_sequence(drive).load(1).images
 
 
 def test_a_command_takes_allow_outside(drive, tmp_path):

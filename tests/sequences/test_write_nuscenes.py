@@ -14,7 +14,6 @@ from nuscenes_tables import Size, token, write_tables
 from test_ways_in import assert_same_frames
 from typer.testing import CliRunner
 
-import bevcli
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Ground
@@ -89,22 +88,19 @@ def test_every_token_leads_to_a_row(tables):
                     assert set(value if isinstance(value, list) else [value]) <= known[target], column
 
 
-def test_rows_are_chained_in_order_of_time(tables):
+def test_rows_are_chained_in_order_of_time(root, tables):
     for name in ("sample", "sample_data"):
         rows = {row["token"]: row for row in tables[name]}
         for row in rows.values():
             if row["next"]:
                 assert rows[row["next"]]["prev"] == row["token"]
                 assert rows[row["next"]]["timestamp"] > row["timestamp"]
+    for row in (*tables["sample_data"], *tables["map"]):
+        assert (root / row["filename"]).is_file()
     [scene] = tables["scene"]
     assert scene["nbr_samples"] == len(tables["sample"]) == 20
     counts = {row["token"]: row["nbr_annotations"] for row in tables["instance"]}
     assert sum(counts.values()) == len(tables["sample_annotation"])
-
-
-def test_every_file_of_the_tables_exists(root, tables):
-    for row in (*tables["sample_data"], *tables["map"]):
-        assert (root / row["filename"]).is_file()
 
 
 def test_the_root_is_read_as_the_same_frames(root):
@@ -118,33 +114,18 @@ def test_the_root_is_read_as_the_same_frames(root):
         assert np.nanmax(np.abs(a.visibilities - b.visibilities)) <= 0.4  # the middle of a level
 
 
-def predictions(drive, model):
-    return [prediction for _, prediction in bevcli.run(model, drive)]
-
-
-@pytest.mark.parametrize("lens", [pytest.param(None, marks=pytest.mark.slow), [-0.2, 0.05, 0, 0]])
-def test_predictions_are_the_same(drive, mini_model, tmp_path, lens):
-    calibration = json.loads((drive / "calibration.json").read_text())
-    if lens is not None:
-        calibration["cameras"]["CAM_BACK"]["distortion"] = {"model": "brown_conrady", "coefficients": lens}
-        (drive / "calibration.json").write_text(json.dumps(calibration))
-    assert convert(drive, tmp_path / "root").exit_code == 0
-    model = bevcli.Model(mini_model)
-    one, other = (predictions(open_sequence(path), model) for path in (drive, tmp_path / "root"))
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_allclose(a.boxes_world.centers, b.boxes_world.centers, atol=1e-5)
-        np.testing.assert_allclose(a.boxes.scores, b.boxes.scores, atol=1e-6)
-    suffix = {path.suffix for path in (tmp_path / "root/samples/CAM_BACK").iterdir()}
-    assert suffix == {".png"}
-
-
 @pytest.mark.slow
 def test_a_real_root_is_converted_to_the_same_frames(nuscenes_root, tmp_path):
     assert convert(nuscenes_root, tmp_path / "out").exit_code == 0
     assert_same_frames(open_sequence(nuscenes_root), open_sequence(tmp_path / "out"), same_bytes=True)
 
 
-def test_scenes_and_missing_images_are_kept(drive, tmp_path):
+def test_scenes_missing_images_and_undistorted_ones_are_kept(drive, tmp_path):
+    calibration = json.loads((drive / "calibration.json").read_text())
+    lens = {"model": "brown_conrady", "coefficients": [-0.2, 0.05, 0, 0]}
+    calibration["cameras"]["CAM_BACK"]["distortion"] = lens
+    (drive / "calibration.json").write_text(json.dumps(calibration))
+    given = open_sequence(drive)
     lines = (drive / "frames.csv").read_text().replace("images/CAM_BACK/1.png", "").splitlines()
     scenes = ["scene", "first", "first", "second", "second"]
     (drive / "frames.csv").write_text("\n".join(f"{s},{line}" for s, line in zip(scenes, lines, strict=True)))
@@ -153,14 +134,11 @@ def test_scenes_and_missing_images_are_kept(drive, tmp_path):
     assert [stamp.scene for stamp in out.stamps] == scenes[1:]
     assert out.load(1).images.keys() == {"CAM_FRONT"}
     assert out.load(0).ground_truth is None
-
-
-def test_what_the_format_cannot_hold_is_refused(drive, tmp_path):
-    (drive / "ego_motion.csv").unlink()
-    answer = convert(drive, tmp_path / "out")
-    assert isinstance(answer.exception, InputError)
-    assert "has no ego-motion, which a nuScenes root must have" in str(answer.exception)
-    assert not (tmp_path / "out").exists()
+    # The tables have no lens: images are undistorted, and written without loss.
+    straight = given.rig["CAM_BACK"].undistort(given.load(0).images["CAM_BACK"].pixels_bgr)
+    assert out.rig["CAM_BACK"].distortion is None
+    np.testing.assert_array_equal(out.load(0).images["CAM_BACK"].pixels_bgr, straight)
+    assert {path.suffix for path in (tmp_path / "out/samples/CAM_BACK").iterdir()} == {".png"}
 
 
 def test_an_existing_root_is_replaced_only_with_force(drive, tmp_path):
@@ -178,6 +156,12 @@ def test_an_existing_root_is_replaced_only_with_force(drive, tmp_path):
 def test_unknown_formats_and_boxes_are_refused(drive, tmp_path):
     answer = CliRunner().invoke(app, ["convert", str(drive), str(tmp_path / "out"), "--format", "kitti"])
     assert "`form=kitti` (`--format`): unknown format (expected " in str(answer.exception)
+    (drive / "ego_motion.csv").rename(tmp_path / "poses.csv")
+    answer = convert(drive, tmp_path / "out")
+    assert isinstance(answer.exception, InputError)
+    assert "has no ego-motion, which a nuScenes root must have" in str(answer.exception)
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "poses.csv").rename(drive / "ego_motion.csv")
     answer = convert(drive, tmp_path / "out", "--boxes", drive)
     assert "`boxes` (`--boxes`): a nuScenes root takes no boxes of a run" in str(answer.exception)
 
