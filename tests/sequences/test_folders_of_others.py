@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import GeoOrigin
+from bevcli.geometry.transforms import GeoOrigin, rigid, rotation_about_z
 from bevcli.sequences.open import open_sequence
 
 STREET = Path(__file__).parents[2] / "samples/street"
@@ -41,13 +41,11 @@ def kalibr_of(folder: Path, count: int) -> Path:
 
 def test_cameras_without_images_are_left_out_with_a_note(tmp_path):
     drive = images_of(tmp_path / "drive", "cam0", "cam3")
-    sequence = open_sequence(
-        drive, calibration=kalibr_of(tmp_path, 6), image_rate_hz=2, ego_motion="static", rig_axes="flu"
-    )
+    how = {"calibration": kalibr_of(tmp_path, 6), "image_rate_hz": 2, "ego_motion": "static", "rig_axes": "flu"}
+    sequence = open_sequence(drive, **how)
     assert sequence.rig.names == ("cam0", "cam3")
     assert "without images, left out: cam1, cam2, cam4, cam5" in " ".join(sequence.notes)
     shutil.copytree(drive / "cam0", drive / "cam8")
-    how = {"calibration": tmp_path / "camchain.yaml", "image_rate_hz": 2, "ego_motion": "static", "rig_axes": "flu"}
     with pytest.raises(InputError, match=r"cam1: the image size is missing.*or name the folder of its images cam1"):
         open_sequence(drive, **how)
     (drive / "cam8").rename(drive / "cam1")
@@ -73,9 +71,8 @@ def test_a_rig_that_stands_is_alike_on_both_sides(tmp_path, axes):
         np.testing.assert_allclose(sequence.rig[name].ego_from_camera[:3, 3], stated["translation"], atol=1e-6)
     other = {"flu": "rfu", "rfu": "flu"}[axes]
     assert f"6 of 6 cameras are alike on both sides, with --rig-axes {other} 0" in " ".join(sequence.notes)
-    assert open_sequence(drive, **how, rig_axes=other).rig["cam0"].yaw == pytest.approx(
-        -np.pi / 2 if axes == "flu" else np.pi / 2
-    )
+    turned = open_sequence(drive, **how, rig_axes=other).rig["cam0"].yaw
+    assert turned == pytest.approx(-np.pi / 2 if axes == "flu" else np.pi / 2)
     with pytest.raises(InputError, match="the images are not compared: pass `--rig-axes"):
         open_sequence(drive, **how, image_check=False)
 
@@ -95,9 +92,8 @@ def test_a_list_of_cameras_in_json(tmp_path):
     drive = images_of(tmp_path / "drive", *FACTS)
     rig = open_sequence(drive, calibration=tmp_path / "rig.json", image_rate_hz=2, ego_motion="static").rig
     assert rig.names == tuple(FACTS)
-    np.testing.assert_allclose(
-        rig["CAM_BACK"].ego_from_camera[:3, 3], FACTS["CAM_BACK"]["ego_from_camera"]["translation"]
-    )
+    place = FACTS["CAM_BACK"]["ego_from_camera"]["translation"]
+    np.testing.assert_allclose(rig["CAM_BACK"].ego_from_camera[:3, 3], place)
 
 
 def test_the_time_of_the_first_image_may_be_stated_for_any_times(tmp_path):
@@ -124,12 +120,7 @@ BASELINES = {0: 0.0, 1: -0.54, 2: 0.06, 3: -0.48}  # of the cameras, from camera
 
 
 def world_from_ego(index: int) -> np.ndarray:
-    yaw, pose = 0.02 * index, np.eye(4)
-    pose[:2, :2], pose[:2, 3] = (
-        [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]],
-        [5.0 * index, 0.05 * index**2],
-    )
-    return pose
+    return rigid((5.0 * index, 0.05 * index**2, 0), rotation_about_z(0.02 * index))
 
 
 def rows(**matrices: np.ndarray) -> str:
@@ -159,9 +150,8 @@ def kitti_raw(root: Path) -> Path:
         (drive / folder / "timestamps.txt").write_text(stamps)
     sizes = {f"S_rect_0{key}": np.array([800.0, 450]) for key in BASELINES}
     projections = {f"P_rect_0{key}": K @ np.c_[np.eye(3), [x, 0, 0]] for key, x in BASELINES.items()}
-    (day / "calib_cam_to_cam.txt").write_text(
-        "calib_time: 09-Jan-2012 13:57:47\n" + rows(**sizes, R_rect_00=np.eye(3), **projections)
-    )
+    text = rows(**sizes, R_rect_00=np.eye(3), **projections)
+    (day / "calib_cam_to_cam.txt").write_text(f"calib_time: 09-Jan-2012 13:57:47\n{text}")
     for name, matrix in (("velo_to_cam", CAMERA_FROM_VELODYNE), ("imu_to_velo", VELODYNE_FROM_IMU)):
         (day / f"calib_{name}.txt").write_text(rows(R=matrix[:3, :3], T=matrix[:3, 3]))
     ego_from_imu = EGO_FROM_VELODYNE @ VELODYNE_FROM_IMU
@@ -173,14 +163,10 @@ def kitti_raw(root: Path) -> Path:
     return drive
 
 
-LAYOUTS = [
-    "raw",
-    "poses/07.txt",
-    *(pytest.param(f"sequences/07/{name}.txt", marks=pytest.mark.slow) for name in ("poses", "07")),
-]
+LATER = (pytest.param(f"sequences/07/{name}.txt", marks=pytest.mark.slow) for name in ("poses", "07"))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("layout", ["raw", "poses/07.txt", *LATER])
 def test_kitti_as_it_lies_on_disk(tmp_path, layout):
     drive = kitti_raw(tmp_path) if layout == "raw" else kitti_odometry(tmp_path, layout)
     sequence = open_sequence(drive, image_check=False)  # its images are of another drive
@@ -211,6 +197,5 @@ def test_a_mistake_in_a_drive_of_kitti_is_one_line(tmp_path):
     (drive.parent / "calib_cam_to_cam.txt").unlink()
     with pytest.raises(InputError, match=r"has no calibration \(expected calib.txt, or calib_cam_to_cam.txt"):
         open_sequence(drive)
-    assert open_sequence(
-        drive, fov_deg=65, height=1.65, yaw_deg={"image_02": 0, "image_03": 0}, ego_motion="static"
-    ).rig
+    yaws = {"image_02": 0, "image_03": 0}
+    assert open_sequence(drive, fov_deg=65, height=1.65, yaw_deg=yaws, ego_motion="static").rig

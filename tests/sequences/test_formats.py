@@ -122,18 +122,13 @@ def test_an_option_of_another_format_is_refused_by_name(drive):
         open_sequence(drive, swept=True)
 
 
-def test_the_dataclass_and_keywords_mean_the_same(drive):
+def test_options_are_a_dataclass_or_keywords_and_a_model_states_its_rate(drive):
     options = InputOptions(every=2, frames=slice(1, 2))
     by_class = open_sequence(drive, options).stamps
     assert by_class == open_sequence(drive, every=2, frames=slice(1, 2)).stamps
     assert open_sequence(drive, options, frames=None).stamps == open_sequence(drive, every=2).stamps
-
-
-def test_the_rate_of_a_model_is_used_unless_another_is_given(drive):
-    """The drive has two frames per second."""
-    assert len(open_sequence(drive, model_rate_hz=1.0).stamps) == 2
-    assert len(open_sequence(drive, model_rate_hz=1.0, rate_hz="all").stamps) == 4
-    assert len(open_sequence(drive, model_rate_hz=1.0, every=1).stamps) == 4
+    for others, count in (({}, 2), ({"rate_hz": "all"}, 4), ({"every": 1}, 4)):  # of four, two a second
+        assert len(open_sequence(drive, model_rate_hz=1.0, **others).stamps) == count
 
 
 def test_the_strongest_format_is_taken(drive, tmp_path):

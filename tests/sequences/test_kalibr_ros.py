@@ -98,6 +98,8 @@ def test_a_lens_has_the_names_of_ros_kalibr_and_opencv(tmp_path, alias, model):
     four = ROS.replace("cols: 5, data: [0.1, -0.2, 0.001, 0.002, 0.03]", "cols: 4, data: [0.1, -0.2, 0.001, 0.002]")
     for text, name in ((four.replace("plumb_bob", alias), "narrow"), (KALIBR.replace("radtan", alias), "cam0")):
         assert read(tmp_path, text, name).distortion.model == model
+    none = ROS.replace("[0.1, -0.2, 0.001, 0.002, 0.03]", "[0, 0, 0, 0, 0]")
+    assert read(tmp_path, none, "narrow").distortion is None
 
 
 def read(folder, intrinsics, name):
@@ -106,15 +108,6 @@ def read(folder, intrinsics, name):
     pose = {"ego_from_camera": {"translation": [0, 0, 0], "rotation_wxyz": [1, 0, 0, 0]}}
     (folder / "poses.json").write_text(json.dumps({"cameras": {name: pose}}))
     return read_rig(folder / "intrinsics.yaml", folder / "poses.json")[name]
-
-
-def test_distortion_with_zero_coefficients_is_none(tmp_path):
-    text = ROS.replace("[0.1, -0.2, 0.001, 0.002, 0.03]", "[0, 0, 0, 0, 0]")
-    assert read_rig(*write(tmp_path, text, {"narrow": POSE}))["narrow"].distortion is None
-
-
-def test_without_files_there_is_no_rig():
-    assert draft_of(RigOptions()) is None
 
 
 @pytest.mark.parametrize(
@@ -138,11 +131,9 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
         read_rig(*write(tmp_path, text, poses))
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
-
-
-def test_intrinsics_without_poses_and_poses_alone_fail(tmp_path):
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
     with pytest.raises(InputError, match=r"cam0: its pose .* is missing"):
         read_rig(intrinsics, None)
     with pytest.raises(InputError, match="must be given together"):
         read_rig(None, extrinsics)
+    assert draft_of(RigOptions()) is None

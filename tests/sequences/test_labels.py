@@ -108,10 +108,8 @@ def test_frames_without_a_row_are_empty_or_unlabelled(
     assert "".join("x" if truth is None else str(len(truth)) for truth in truths) == expected
     assert any(note in each for each in labelled.notes)
     assert any("a column `instance` would give them" in each for each in labelled.notes) == bool(listed)
-
-
-def test_an_empty_frame_at_the_rate_of_the_labels_is_empty() -> None:
-    stamps = tuple(replace(MadeDrive().stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
+    # Of a longer drive of two scenes, also where the labels have a lower rate.
+    stamps = tuple(replace(drive.stamps[0], index=index, scene="ab"[index // 12]) for index in range(24))
     assert sorted(_labelled_frames(stamps, {3, 9, 18}, None)) == [3, 9, 18]
     assert sorted(_labelled_frames(stamps, {1, 4, 10}, None)) == [1, 4, 7, 10]
 
@@ -177,14 +175,11 @@ def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path
     (tmp_path / "0000.txt").write_text(text)
     with pytest.raises(InputError, match=message):
         WithLabels(MadeDrive(), tmp_path / "0000.txt")
-    with pytest.raises(InputError, match=r"`labels_camera=roof` .*: is not in the rig"):
-        WithLabels(MadeDrive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
-
-
-def test_labels_of_another_kind_are_refused(tmp_path: Path) -> None:
     (tmp_path / "labels.xml").write_text("")
     with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or KITTI labels"):
         WithLabels(MadeDrive(), tmp_path / "labels.xml")
+    with pytest.raises(InputError, match=r"`labels_camera=roof` .*: is not in the rig"):
+        WithLabels(MadeDrive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))
 
 
 def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
