@@ -193,6 +193,13 @@ def test_a_planted_mistake_is_the_only_finding(name):
     assert finding.severity == ("warning" if name in ("wheel", "a little turned", "early", "antenna") else "error")
 
 
+def test_two_mistakes_have_two_findings_and_frames_their_numbers():
+    findings = compare(stated(3.6 * POSITIONS, np.pi / 2 - YAWS), SHOWN)
+    assert [finding.code for finding in findings] == ["motion-angles", "motion-scale"]
+    (finding,) = compare(jumping(), SHOWN, range(40, 49))
+    assert "between frames 43 and 44" in finding.found
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_sound_poses_have_no_finding(seed):
     times, positions, yaws = drive(seed=seed, turning=seed % 3, changing=seed % 2)
@@ -220,11 +227,6 @@ def test_a_number_is_within_3_deviations(poses, number, true):
     assert deviation < max(0.1 * true, 0.3)
 
 
-def test_two_mistakes_have_two_findings():
-    findings = compare(stated(3.6 * POSITIONS, np.pi / 2 - YAWS), SHOWN)
-    assert [finding.code for finding in findings] == ["motion-angles", "motion-scale"]
-
-
 def test_poses_of_the_frames_alone_show_another_time():
     rows = np.arange(FIRST, FIRST + EVERY * FRAMES, EVERY)
     (finding,) = compare(planar(POSITIONS[rows], YAWS[rows], TIMES[rows] + 500_000_000), SHOWN)
@@ -238,11 +240,6 @@ def test_images_that_stand_still_are_told():
     assert (finding.code, finding.severity) == ("motion-stands", "error")
     assert "the images stand still" in finding.message
     assert compare(stated(0 * POSITIONS, 0 * YAWS), shown) == ()
-
-
-def test_frames_of_a_jump_have_the_given_numbers():
-    (finding,) = compare(jumping(), SHOWN, range(40, 49))
-    assert "between frames 43 and 44" in finding.found
 
 
 def test_wide_deviations_are_no_comparison():

@@ -77,15 +77,12 @@ def test_speed_and_yaw_rate_are_those_of_the_step():
     rate, rate_deviation = yaw_rates_deg(curve())
     assert rate == pytest.approx(np.degrees(0.4))
     assert rate_deviation == pytest.approx(np.degrees(0.02))
-
-
-def test_a_vehicle_that_drives_back_has_a_negative_speed():
-    motion = curve(1)
-    back = MeasuredMotion("back", motion.timestamps_ns, (MeasuredStep(rigid((-1, 0, 0)), np.eye(6)),))
+    back = MeasuredMotion("back", curve(1).timestamps_ns, (MeasuredStep(rigid((-1, 0, 0)), np.eye(6)),))
     assert speeds(back)[0] == pytest.approx(-2)
 
 
 def test_the_files_give_the_motion_back(street, tmp_path):
+    """Also at the times of the images, which are not those of the frames."""
     motion = motion_of(street)
     write_report(motion, tmp_path / "out")
     read = read_ego_motion(tmp_path / "out/ego_motion.csv")
@@ -95,13 +92,8 @@ def test_the_files_give_the_motion_back(street, tmp_path):
     assert len(report["steps"]) == len(motion.steps)
     assert report["steps"][2]["translation_deviation_m"] == pytest.approx([0.01] * 3)
     assert report["stated"] is None
-
-
-def test_the_written_poses_are_those_of_the_drive(street, tmp_path):
-    """Also at the times of the images, which are not those of the frames."""
-    write_report(motion_of(street), tmp_path)
-    copy = street_copy(tmp_path / "copy", 6)
-    again = bevcli.open_sequence(copy, ego_motion_file=tmp_path / "ego_motion.csv", ground_truth=False)
+    copy, poses = street_copy(tmp_path / "copy", 6), tmp_path / "out/ego_motion.csv"
+    again = bevcli.open_sequence(copy, ego_motion_file=poses, ground_truth=False)
     first = np.linalg.inv(street.load(0).world_from_ego.matrix)
     for place in range(len(street.stamps)):
         stated, written = street.load(place), again.load(place)
@@ -132,10 +124,7 @@ def test_a_drive_without_a_measured_step_is_refused():
     check_measured(curve())
     with pytest.raises(InputError, match=r"curve: not one of 6 steps could be measured \(too dark\)"):
         check_measured(curve(reason="too dark"))
-
-
-def test_one_frame_has_a_report_without_steps():
-    still = MeasuredMotion("still", np.array([5], dtype=np.int64), ())
+    still = MeasuredMotion("still", np.array([5], dtype=np.int64), ())  # one frame has no steps
     assert "0.00 m in 0.0 s, 0 steps" in report_text(still)
     assert json.loads(to_json(still))["mean_speed_m_s"] is None
 
@@ -179,6 +168,11 @@ def test_cells_lie_ahead_and_to_the_left_first():
     assert cells[0, 0] == pytest.approx((14.95, 14.95, 0))
     assert cells[-1, 0] == pytest.approx((-14.95, 14.95, 0))
     assert cells[0, -1] == pytest.approx((14.95, -14.95, 0))
+    drive = MemoryDrive(1)
+    drive.has_ego_motion = False
+    watched = WatchedDrive(drive)
+    watched.load(0)
+    assert watched.stated_poses is None
 
 
 def test_a_frame_shows_the_board_from_above(watched):
@@ -201,11 +195,6 @@ def test_the_stitched_road_is_the_board(watched):
     seen = road.image[..., 0] < 240
     assert seen.mean() > 0.2
     assert ((road.image[..., 0] > 140) == squares(np.stack([x, y], axis=-1)))[seen].mean() > 0.95
-
-
-def test_pixels_of_poses_are_where_the_road_was_stitched(watched):
-    drive, motion = watched
-    road = stitched(drive, motion.poses)
     first, last = road.pixels(motion.poses)[[0, -1]]
     assert first == pytest.approx((150, road.image.shape[0] - 150), abs=1.5)
     assert (last - first)[0] == pytest.approx(90, abs=1)  # 9 m ahead
@@ -213,9 +202,8 @@ def test_pixels_of_poses_are_where_the_road_was_stitched(watched):
 
 def test_the_picture_and_the_recording_are_written(watched, tmp_path):
     drive, motion = watched
-    points = SeenPoints(
-        np.zeros(1, np.int16), np.full((1, 2), 0.5, np.float32), np.ones(1, np.float32), np.ones(1, bool)
-    )
+    where = np.full((1, 2), 0.5, np.float32)
+    points = SeenPoints(np.zeros(1, np.int16), where, np.ones(1, np.float32), np.ones(1, bool))
     seen, unseen = replace(motion.steps[0], seen=points), replace(motion.steps[2], reason="too dark")
     guessed = replace(motion, steps=(seen, motion.steps[1], unseen))
     road = stitched(drive, motion.poses)
@@ -232,18 +220,9 @@ def test_an_even_choice_of_the_points_is_shown_where_they_are():
     cameras = [make_camera("front", 0, 640, 360), make_camera("back", 180, 640, 360)]
     pixels = np.stack([np.linspace(10, 630, 400), np.linspace(20, 340, 400)], axis=-1)
     of, residuals = np.arange(400) % 2, np.full((400, 2), 3.0)
-    seen = seen_points(
-        cameras, (of, cameras[0].rays(pixels), residuals), (of[:4], cameras[0].rays(pixels[:4]), residuals[:4])
-    )
+    rays = cameras[0].rays(pixels)
+    seen = seen_points(cameras, (of, rays, residuals), (of[:4], rays[:4], residuals[:4]))
     assert np.bincount(seen.camera[~seen.is_road]).tolist() == [50, 50]  # every fourth of 200
     assert seen.is_road.sum() == 4
     assert seen.at[0] * (640, 360) == pytest.approx(pixels[0], abs=0.01)
     assert seen.residuals_px == pytest.approx(np.hypot(3, 3))
-
-
-def test_a_drive_without_poses_has_no_stated_ones():
-    drive = MemoryDrive(1)
-    drive.has_ego_motion = False
-    watched = WatchedDrive(drive)
-    watched.load(0)
-    assert watched.stated_poses is None

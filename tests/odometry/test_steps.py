@@ -120,9 +120,8 @@ def test_tiles_vote_for_the_distance_driven() -> None:
 def test_the_flow_tells_what_a_motion_misses() -> None:
     flow = road_flow(picture((0, 0)), picture((1, -12)), 0.0, np.array([11.0, 0]) * CELL_M, 0.5)
     assert len(flow.first) > 100
-    np.testing.assert_allclose(
-        np.median(flow.first - flow.second, axis=0), [12 * CELL_M, -CELL_M, 0], atol=0.1 * CELL_M
-    )
+    missed = np.median(flow.first - flow.second, axis=0)
+    np.testing.assert_allclose(missed, [12 * CELL_M, -CELL_M, 0], atol=0.1 * CELL_M)
 
 
 def test_a_vehicle_that_drives_along_a_slope_stays_on_it() -> None:
@@ -150,13 +149,8 @@ def test_the_neighbours_decide_where_votes_are_about_equal() -> None:
     assert chosen([[driven(4.1, 5.0)], [wrong, right], [driven(3.9, 5.0)]]) == [4.1, 4.0, 3.9]
     assert chosen([[wrong, right], [driven(4.0, 5.0)]]) == [4.0, 4.0]  # the next step decides about the first
     assert chosen([[driven(4.0, 5.0)], [wrong, right]]) == [4.0, 4.0]
-
-
-def test_many_votes_outweigh_a_change_of_speed() -> None:
+    # Many votes outweigh a change of speed; backwards is not the same speed.
     assert chosen([[driven(4.0, 5.0)], [driven(3.0, 9.0), driven(4.0, 2.0)]]) == [4.0, 3.0]
-
-
-def test_backwards_is_not_the_same_speed() -> None:
     assert chosen([[driven(-2.0, 5.0)], [driven(2.0, 4.1), driven(-2.0, 4.0)]]) == [-2.0, -2.0]
 
 
@@ -235,10 +229,7 @@ def test_points_that_stay_tell_nothing() -> None:
     assert np.isfinite(found).sum() == 30
     assert most_voted(found) == pytest.approx(3.0, abs=0.05)
     assert point_votes(found, np.zeros(1)) == pytest.approx(CHANCE)  # "stands" gets the least votes
-
-
-def test_few_points_do_not_vote() -> None:
-    np.testing.assert_array_equal(point_votes(np.full(5, 3.0), DISTANCES), 1.0)
+    np.testing.assert_array_equal(point_votes(np.full(5, 3.0), DISTANCES), 1.0)  # few points do not vote
 
 
 def stays(points: Array, moved_m: Array) -> bool:
@@ -263,7 +254,4 @@ def test_a_vehicle_stands_although_one_car_moves() -> None:
 def test_a_creeping_vehicle_does_not_stand() -> None:
     assert not stays(before_houses(180, 20), np.full(200, 0.07))  # 90 % of the points stay, but not those of the road
     assert stays(before_houses(180, 20), np.full(200, 0.001))
-
-
-def test_few_points_do_not_tell_that_a_vehicle_stands() -> None:
-    assert not stays(before_houses(20, 0), np.zeros(20))
+    assert not stays(before_houses(20, 0), np.zeros(20))  # few points do not tell

@@ -32,11 +32,6 @@ def test_deep_json_is_refused(levels, start, end):
     assert "nested too deeply" in refused(parse_json, start * levels, "file")
 
 
-def test_brackets_in_a_text_are_no_nesting():
-    text = b'{"a": "' + b"[" * 1000 + b'\\"[", "b": [' + b'"{", ' * 100 + b"1]}"
-    assert parse_json(text, "file")["b"][-1] == 1
-
-
 @pytest.mark.parametrize("number", ["9" * 19, "-" + "9" * 30, "1" * 4301, "1" * 1_000_000])
 def test_integers_beyond_62_bits_are_refused_in_every_format(tmp_path, number):
     path = tmp_path / "file"
@@ -52,11 +47,12 @@ def test_integers_beyond_62_bits_are_refused_in_every_format(tmp_path, number):
 def test_long_fractions_and_the_largest_integers_are_read():
     text = b"[0.12345678901234567890123, 4611686018427387904, -4611686018427387904]"
     assert parse_json(text, "file") == [0.12345678901234567890123, 2**62, -(2**62)]
-
-
-def test_half_a_character_is_refused():
-    refused(parse_json, b'["\\ud800"]', "file")
+    for value in ([1.0, True], [[0, False]], [1, "1"], [[1], [1, 2]]):
+        assert array_of_numbers(value) is None
+    refused(parse_json, b'["\\ud800"]', "file")  # half a character
     assert parse_json(b'["\\ud83d\\ude00"]', "file") == ["\N{GRINNING FACE}"]
+    text = b'{"a": "' + b"[" * 1000 + b'\\"[", "b": [' + b'"{", ' * 100 + b"1]}"  # brackets in a text are no nesting
+    assert parse_json(text, "file")["b"][-1] == 1
 
 
 @pytest.mark.parametrize(
@@ -78,12 +74,6 @@ def test_odd_yaml_is_refused(tmp_path, text):
     path = tmp_path / "file.yaml"
     path.write_text(text)
     refused(read_yaml, path)
-
-
-def test_an_alias_of_a_plain_list_is_read(tmp_path):
-    path = tmp_path / "file.yaml"
-    path.write_text("a: &x [1, 2]\nb: *x\n")
-    assert read_yaml(path) == {"a": [1, 2], "b": [1, 2]}
 
 
 @pytest.mark.parametrize(
@@ -129,6 +119,8 @@ def test_a_merge_may_be_overridden_and_an_exponent_makes_a_number(tmp_path):
     path.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, x: 1e-05}\nc: [1E5, -2.e3, .5e-1, 1e5x, e5, 1.5, 0x1e5, 2e+3]\n")
     numbers = [1e5, -2e3, 0.05, "1e5x", "e5", 1.5, 0x1E5, 2e3]
     assert read_yaml(path) == {"a": {"x": 1, "y": 2}, "b": {"x": 1e-05, "y": 2}, "c": numbers}
+    path.write_text("a: &x [1, 2]\nb: *x\n")  # as an alias of a plain list is read
+    assert read_yaml(path) == {"a": [1, 2], "b": [1, 2]}
 
 
 def test_what_only_yaml_1_1_takes_for_a_number_is_text(tmp_path):
@@ -138,11 +130,6 @@ def test_what_only_yaml_1_1_takes_for_a_number_is_text(tmp_path):
     *found, values = read_yaml(path)
     assert found == [*texts[:-1], None]
     assert values == [0, 0, 7, 0.0, 1.0, 0.5, True, False, None, None]
-
-
-@pytest.mark.parametrize("value", [[1.0, True], [[0, False]], [1, "1"], [[1], [1, 2]]])
-def test_numbers_are_numbers(value):
-    assert array_of_numbers(value) is None
 
 
 @pytest.mark.parametrize("text", [b'{"a": 1, "b": 2, "a": 3}', b'[{"x": {"a": 1, "a": 1}}]'])

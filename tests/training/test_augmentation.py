@@ -32,6 +32,12 @@ def test_probability_zero_leaves_images_unchanged() -> None:
     images = torch.ones(1, 2, 3, 8, 8)
     mask_images(images, 0.0, random)
     assert (images == 1).all()
+    for variation in (ImageVariation, CalibrationVariation, BadConditions):
+        assert variation(NONE, random)(frame) is frame
+    assert randomised(images, RandomisationConfig(), LITE, torch.Generator()) is images
+    assert AugmentationConfig().randomisation == RandomisationConfig()
+    with pytest.raises(ValueError, match="color is a probability"):
+        RandomisationConfig(color=1.5)
 
 
 def test_distortion_changes_the_image_and_is_reproducible() -> None:
@@ -63,13 +69,6 @@ def test_the_grid_mask_covers_about_a_quarter() -> None:
     covered = (images == 0).float().mean((-1, -2, -3))
     assert ((covered > 0.05) & (covered < 0.6)).all()
     assert covered.mean().item() == pytest.approx(0.25, abs=0.1)
-
-
-def test_images_and_calibration_stay_unless_the_config_says_so() -> None:
-    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
-    assert ImageVariation(NONE, random)(frame) is frame
-    assert CalibrationVariation(NONE, random)(frame) is frame
-    assert BadConditions(NONE, random)(frame) is frame
 
 
 def test_exposure_and_white_balance_last_a_clip_by_camera() -> None:
@@ -106,13 +105,9 @@ def test_camera_poses_have_one_noise_in_all_frames_of_a_clip() -> None:
         assert 0 < np.linalg.norm(moved[:3, 3]) < 0.6
         assert 0 < np.degrees(np.arccos((np.trace(moved[:3, :3]) - 1) / 2)) < 8
         assert np.array_equal(camera.intrinsics, noisy.intrinsics)
-
-
-def test_a_share_of_the_clips_has_calibration_noise() -> None:
-    frame, random = MemoryDrive(1).load(0), np.random.default_rng(0)
-    config = AugmentationConfig(calibration_share=0.25)
-    noisy = [CalibrationVariation(config, random)(frame) is not frame for _ in range(200)]
-    assert np.mean(noisy) == pytest.approx(0.25, abs=0.08)
+    frame, random, quarter = sequence.load(0), np.random.default_rng(0), AugmentationConfig(calibration_share=0.25)
+    changed = [CalibrationVariation(quarter, random)(frame) is not frame for _ in range(200)]
+    assert np.mean(changed) == pytest.approx(0.25, abs=0.08)
 
 
 def test_all_images_of_a_clip_have_the_same_corruption() -> None:
@@ -182,12 +177,6 @@ def test_a_seed_gives_the_same_images_and_another_seed_others() -> None:
     assert not torch.equal(changed(pixels, ALL), changed(pixels, ALL, seed=1))
 
 
-def test_without_probabilities_images_are_the_same_tensor() -> None:
-    images = made_images()
-    assert randomised(images, RandomisationConfig(), LITE, torch.Generator()) is images
-    assert AugmentationConfig().randomisation == RandomisationConfig()
-
-
 @pytest.mark.parametrize("change", list(vars(ALL)))
 def test_each_change_alters_about_its_share_of_the_images(change: str) -> None:
     pixels = made_images(200)
@@ -247,8 +236,3 @@ def test_padding_and_missing_images_stay_zero() -> None:
     assert not found[..., 24:, :].any()
     assert not found[..., 40:].any()
     assert (found[1, 2, :, :24, :40] != images[1, 2, :, :24, :40]).all()
-
-
-def test_a_probability_above_one_is_refused() -> None:
-    with pytest.raises(ValueError, match="color is a probability"):
-        RandomisationConfig(color=1.5)

@@ -46,10 +46,8 @@ def prepare(fleet: Path, tmp_path: Path) -> Callable[..., TrainingJob]:
         *names: str, classes: tuple[str, ...] = (), changes: dict[str, str] = SETTINGS, **data: object
     ) -> TrainingJob:
         toml = tmp_path / "mini.toml"
-        text = MINI_TOML.partition("cameras =")
-        toml.write_text(
-            f'name = "mini"\nclasses = {json.dumps(classes)}\n{"".join(text[1:])}' if classes else MINI_TOML
-        )
+        own = f'name = "mini"\nclasses = {json.dumps(classes)}\ncameras ={MINI_TOML.partition("cameras =")[2]}'
+        toml.write_text(own if classes else MINI_TOML)
         folders = tuple(fleet / name for name in names)
         options = TrainOptions(out=tmp_path / "out", changes={**SETTINGS, **changes})
         return prepare_training(str(toml), CPU, DriveOptions(data=folders, **data), options)
@@ -57,14 +55,18 @@ def prepare(fleet: Path, tmp_path: Path) -> Callable[..., TrainingJob]:
     return prepare
 
 
-def test_a_note_a_set_names_dropped_boxes_with_counts(prepare: Callable[..., TrainingJob]) -> None:
+def test_a_training_states_its_drives_and_notes(prepare: Callable[..., TrainingJob], fleet: Path) -> None:
     job = prepare("d000", "d001", "d002", classes=("bicycle", "deer"))
+    split = read_split(job.out / "split.toml")
+    assert (split.train, split.validate) == ((fleet / "d000", fleet / "d001"), (fleet / "d002",))
     dropped, absent, scored, _ = job.notes
-    assert dropped.startswith(
-        "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map` "
-    )
+    said = "the 2 drives to train on: 6 boxes have other classes and are not trained on: car (6) (`class_map` "
+    assert dropped.startswith(said)
     assert absent == "the 2 drives to train on: no box has the class deer of the model mini"
     assert scored.startswith("the drive to score on: 3 boxes have other classes and are not scored: car (3)")
+    job.lock.close()
+    notes = prepare("d000", "d001", changes={"freeze_batch_norm": "true"}).notes
+    assert any("starts from random weights, but its file keeps the statistics of batch norms" in note for note in notes)
 
 
 def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_path: Path) -> None:
@@ -73,6 +75,8 @@ def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_pat
     with pytest.raises(InputError, match=r"ground truth of rendered drives has no class .*set classes in the model's"):
         prepare(classes=("deer",), rendered=(1, 2))
     assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match=r"fewer frames than a clip, 21 .*: rendered drives \(20\)"):
+        prepare(rendered=(1, 2), changes={"clips.frames": "21"})
     assert prepare("d000", "d001", classes=("deer",), class_map={"car": "deer"}).out.is_dir()
 
 
@@ -116,26 +120,15 @@ def test_wrong_weights_leave_no_folder(fleet: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_rendered_drives_are_as_long_as_a_clip(prepare: Callable[..., TrainingJob]) -> None:
-    with pytest.raises(InputError, match=r"fewer frames than a clip, 21 .*: rendered drives \(20\)"):
-        prepare(rendered=(1, 2), changes={"clips.frames": "21"})
-
-
-def test_boxes_of_a_format_without_a_table_are_counted(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config, data = load_config(fleet / "mini.toml"), DriveOptions(data=(fleet / "d000",))
-    config = replace(config, classes=("car", "Rad"))
-    expected = check_scored_drives(data, scored_drives(data, config), config)
-    monkeypatch.setattr(FolderDrive, "class_counts", {})
-    assert check_scored_drives(data, scored_drives(data, config), config) == expected
-
-
-def test_scored_drives_have_notes_too(fleet: Path) -> None:
+def test_scored_drives_have_notes_too(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(load_config(fleet / "mini.toml"), classes=("car", "Rad"))
     data = DriveOptions(data=(fleet / "d000",))
-    (dropped, _) = check_scored_drives(data, scored_drives(data, config), config)
+    notes = (dropped, _) = check_scored_drives(data, scored_drives(data, config), config)
     assert dropped.startswith("the drive: 3 boxes have other classes and are not scored: bicycle (3)")
     with pytest.raises(InputError, match="has no class of the model"):
         check_scored_drives(data, scored_drives(data, config), replace(config, classes=("deer",)))
+    monkeypatch.setattr(FolderDrive, "class_counts", {})  # as of a format without a table
+    assert check_scored_drives(data, scored_drives(data, config), config) == notes
 
 
 def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
@@ -153,22 +146,8 @@ def test_a_split_file_states_both_sets(fleet: Path, tmp_path: Path) -> None:
         scored_drives(DriveOptions(data=(fleet,), split=file), load_config(fleet / "mini.toml"))
     with pytest.raises(InputError, match=r"remove `held_out` \(`--held-out`\), or `split` \(`--split`\)"):
         prepare_training("demo", CPU, DriveOptions(split=file), TrainOptions(tmp_path / "other", held_out=1))
-
-
-def test_a_training_states_its_drives(prepare: Callable[..., TrainingJob], fleet: Path) -> None:
-    split = read_split(prepare("d001", "d000", "d003").out / "split.toml")
-    assert (split.train, split.validate) == ((fleet / "d001", fleet / "d000"), (fleet / "d003",))
-
-
-def test_a_star_stands_for_folders_in_order(fleet: Path) -> None:
-    file = fleet / "star.toml"
-    file.write_text('train = ["d00?"]\nvalidate = ["without/d*"]\n')
+    file.write_text('train = ["d00?"]\nvalidate = ["without/d*"]\n')  # a star stands for folders in order
     assert [path.name for path in read_split(file).train] == ["d000", "d001", "d002", "d003"]
-
-
-def test_batch_norms_kept_from_random_weights_are_said(prepare: Callable[..., TrainingJob]) -> None:
-    notes = prepare("d000", "d001", changes={"freeze_batch_norm": "true"}).notes
-    assert any("starts from random weights, but its file keeps the statistics of batch norms" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -189,12 +168,8 @@ def test_a_wrong_split_is_one_clear_line(text: str, message: str, fleet: Path) -
 
 
 def test_changes_have_the_types_of_toml() -> None:
-    changes = {
-        "optimizer.learning_rate": "1e-4",
-        "clips.batch": "2",
-        "weights_dtype": "float16",
-        "clips.learn": '"all"',
-    }
+    changes = {"optimizer.learning_rate": "1e-4", "clips.batch": "2", "weights_dtype": "float16"}
+    changes |= {"clips.learn": '"all"'}
     changed = with_changes(TrainingConfig(), changes)
     assert changed.optimizer.learning_rate == 1e-4
     assert changed.clips == ClipConfig(batch=2, learn="all")
@@ -218,13 +193,11 @@ def test_a_wrong_change_is_one_clear_line(key: str, value: str, message: str) ->
 
 
 def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_path: Path) -> None:
-    settings = [
-        text for key, value in (SETTINGS | {"clips.learn": "all"}).items() for text in ("--set", f"{key}={value}")
-    ]
+    changes = SETTINGS | {"clips.learn": "all"}
+    settings = [text for key, value in changes.items() for text in ("--set", f"{key}={value}")]
     drives = [text for name in ("d000", "d001") for text in ("--data", str(fleet / name))]
-    done = command(
-        tmp_path, "train", "--model", fleet / "mini.toml", *drives, *settings, "--out", "out", "--log", "tensorboard"
-    )
+    options = ("--out", "out", "--log", "tensorboard")
+    done = command(tmp_path, "train", "--model", fleet / "mini.toml", *drives, *settings, *options)
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()
     assert lines[0] == (
@@ -234,9 +207,8 @@ def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_pat
     assert lines[1].startswith("note: the drive to train on: no box has the class truck or ")
     assert lines[3].startswith("1/2 updates, ")
     assert ", step 1, loss " in lines[3]
-    assert (tmp_path / "out" / "weights.safetensors").stat().st_mode & 0o777 == (
-        fleet / "mini.toml"
-    ).stat().st_mode & 0o777
+    modes = [path.stat().st_mode & 0o777 for path in (tmp_path / "out/weights.safetensors", fleet / "mini.toml")]
+    assert modes[0] == modes[1]
     assert list((tmp_path / "out" / "tensorboard").glob("events.out.tfevents.*"))
 
 

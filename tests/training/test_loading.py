@@ -229,13 +229,7 @@ def test_clips_trained_on_as_a_whole_have_no_gap() -> None:
 
 def test_a_clip_stays_in_its_scene() -> None:
     assert set(drawn(MemoryDrive(6, scenes="aaabbb"), frames=3)) == {(0, 1, 2), (3, 4, 5)}
-
-
-def test_a_clip_of_one_frame_has_no_history() -> None:
     assert set(drawn(MemoryDrive(3), frames=1)) == {(0,), (1,), (2,)}
-
-
-def test_a_drive_too_short_for_a_clip_is_rejected() -> None:
     with pytest.raises(InputError, match="memory: no scene has 4 frames or more"):
         drawn(MemoryDrive(6, scenes="aaabbb"), frames=4)
 

@@ -51,12 +51,9 @@ def test_no_permutation_is_cheaper_than_the_matching(shape: tuple[int, int]) -> 
     assert len(set(queries)) == len(set(truths)) == small
 
 
-def test_no_ground_truth_gives_no_pairs() -> None:
-    assert pairs(torch.zeros(4, 1), 0) == ([], [])
-
-
 def test_a_pair_with_a_nan_cost_is_chosen_last() -> None:
     assert pairs(torch.tensor([[float("nan"), 0.0], [1.0, 5.0]])) == ([0, 1], [1, 0])
+    assert pairs(torch.zeros(4, 1), 0) == ([], [])  # without ground truth there are none
 
 
 def test_focal_loss_by_hand() -> None:
@@ -96,6 +93,9 @@ def test_detection_loss_by_hand() -> None:
     loss = detection_loss(logits, codes, [targets(code(x=1.0))], CONFIG)
     assert loss["boxes"].item() == pytest.approx(0.25 * (0.5 + 0.2 * 3.0))
     assert loss["classes"].item() == pytest.approx(2 * (0.25 + 0.75) / 4 * log(2))
+    loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
+    assert loss["boxes"].item() == 0  # without boxes every query is background
+    assert loss["classes"].item() == pytest.approx(2 * 6 * 0.75 / 4 * log(2))
 
 
 def test_query_groups_are_matched_independently() -> None:
@@ -115,15 +115,6 @@ def test_of_two_queries_at_a_position_the_confident_is_matched() -> None:
     p = 1 / (1 + exp(-2))
     positive, negative = 0.25 * (1 - p) ** 2 * -log(p), 0.75 * (1 - p) ** 2 * -log(p)
     assert loss == pytest.approx(2 * (positive + negative), rel=1e-4)
-
-
-def test_losses_are_divided_by_the_number_of_boxes_in_the_batch() -> None:
-    codes = torch.tensor([code(2.0)]).expand(1, 2, 1, 10)
-    logits = torch.zeros(1, 2, 1, 1)
-    one = detection_loss(logits[:, :1], codes[:, :1], [targets(code(0.0))], CONFIG)
-    two = detection_loss(logits, codes, [targets(code(0.0))] * 2, CONFIG)
-    assert two["boxes"].item() == pytest.approx(one["boxes"].item())
-    assert two["classes"].item() == pytest.approx(one["classes"].item())
 
 
 def test_every_layer_adds_its_loss() -> None:
@@ -160,12 +151,6 @@ def test_the_class_target_can_fall_with_the_distance() -> None:
     assert class_loss(best - 0.1) > 1e-3 < class_loss(best + 0.1)
 
 
-def test_without_boxes_every_query_is_background() -> None:
-    loss = detection_loss(torch.zeros(1, 1, 3, 2), torch.zeros(1, 1, 3, 10), [targets()], CONFIG)
-    assert loss["boxes"].item() == 0
-    assert loss["classes"].item() == pytest.approx(2 * 6 * 0.75 / 4 * log(2))
-
-
 GRID = BevGrid(4, 4, (-4, 4), (-4, 4), (-3, 3), 4)  # cells of 2 m, centres at ±1 and ±3
 
 
@@ -186,12 +171,8 @@ def test_cells_in_reach_are_positives_of_the_nearest_object() -> None:
     loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [truth], config, weights)
     # Two cells are positives: (1, 1) without an error, (1, 3) with half a metre.
     assert loss["cell boxes"].item() == pytest.approx(2.0 * 0.5 * 0.5 / 2)
-
-
-def test_a_frame_without_objects_has_negatives_only() -> None:
-    nothing = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
-    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [nothing], DenseLossConfig(1.0), DetectionLossConfig())
-    assert loss["cell boxes"].item() == 0
+    loss = dense_loss(zero_head(), torch.zeros(1, 16, 2), [targets()], DenseLossConfig(1.0), DetectionLossConfig())
+    assert loss["cell boxes"].item() == 0  # of a frame without objects
     assert loss["cell classes"].item() > 0
 
 
@@ -216,9 +197,8 @@ def assert_mean_of_frames(
     """
     frames = [loss(slice(b, b + 1)) for b in range(len(counts))]
     for name, value in loss(slice(None)).items():
-        expected = torch.stack([one[name] * count for one, count in zip(frames, counts, strict=True)]).sum() / sum(
-            counts
-        )
+        weighted = [one[name] * count for one, count in zip(frames, counts, strict=True)]
+        expected = torch.stack(weighted).sum() / sum(counts)
         torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
         gradients = (
             torch.autograd.grad(one, leaves, retain_graph=True, materialize_grads=True) for one in (value, expected)
@@ -292,6 +272,9 @@ TRUTH = SegmentationTargets(
 
 def test_a_perfect_output_has_no_loss_in_any_order_of_its_things() -> None:
     assert total(segmentation_loss(PERFECT, [TRUTH], MAP_WEIGHTS)) == pytest.approx(0, abs=1e-4)
+    logits = torch.cat([torch.zeros_like(PERFECT.mask_logits), PERFECT.mask_logits])
+    two = SegmentationOutputs(logits, PERFECT.class_logits.expand(2, -1, -1), PERFECT.locations)
+    assert segmentation_loss(two, [TRUTH], MAP_WEIGHTS)["masks"].item() > 0.5  # every layer of masks has a loss
 
 
 def test_the_location_loss_is_the_distance() -> None:
@@ -329,18 +312,10 @@ def test_a_frame_without_a_map_has_no_stuff_loss() -> None:
     assert total(segmentation_loss(wrong, [unknown], MAP_WEIGHTS)) == pytest.approx(0, abs=1e-4)
 
 
-def test_every_mask_layer_has_a_loss() -> None:
-    logits = torch.cat([torch.zeros_like(PERFECT.mask_logits), PERFECT.mask_logits])
-    two = SegmentationOutputs(logits, PERFECT.class_logits.expand(2, -1, -1), PERFECT.locations)
-    assert segmentation_loss(two, [TRUTH], MAP_WEIGHTS)["masks"].item() > 0.5
-
-
 def test_vehicles_do_not_lower_the_weight_of_the_road() -> None:
     logits = PERFECT.mask_logits.clone()
     logits[0, 0, 0] = 0  # the road is undecided
     one_wrong = SegmentationOutputs(logits, PERFECT.class_logits, PERFECT.locations)
     without_things = SegmentationTargets(TRUTH.stuff, TRUTH.things[:0], TRUTH.locations[:0])
-    with_things = segmentation_loss(one_wrong, [TRUTH], MAP_WEIGHTS)["masks"].item()
-    assert with_things == pytest.approx(
-        segmentation_loss(one_wrong, [without_things], MAP_WEIGHTS)["masks"].item(), abs=1e-4
-    )
+    both = [segmentation_loss(one_wrong, [each], MAP_WEIGHTS)["masks"].item() for each in (TRUTH, without_things)]
+    assert both[0] == pytest.approx(both[1], abs=1e-4)

@@ -108,21 +108,14 @@ def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_step_costs_its_updates_or_the_reading_of_its_batches() -> None:
+def test_the_cost_of_a_step_the_batch_and_the_class_of_a_size() -> None:
     config = TrainingConfig(steps=10, clips=ClipConfig(frames=4, learn="all", in_turn=2))
-    assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0
-    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 12.0
-
-
-def test_a_batch_fills_the_card_but_never_shrinks() -> None:
-    gigabytes = 10**9
+    assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0  # its updates
+    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 12.0  # the reading of its batches
+    assert all(class_of_size(*size) == name for name, size in NUSCENES_SIZES.items())
+    assert [class_of_size(*size) for size in ((4.1, 1.8, 1.5), (0.6, 0.6, 1.6))] == ["car", "pedestrian"]
+    gigabytes = 10**9  # a batch fills the card, but never shrinks
     assert fitting_batch(4, 7 * gigabytes, 20 * gigabytes, 32) == 8
     assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 32) == 32
     assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 3) == 4
     assert fitting_batch(1, 7 * gigabytes, 8 * gigabytes, 32) == 1
-
-
-def test_a_class_is_like_that_of_the_nearest_size() -> None:
-    assert all(class_of_size(*size) == name for name, size in NUSCENES_SIZES.items())
-    assert class_of_size(4.1, 1.8, 1.5) == "car"
-    assert class_of_size(0.6, 0.6, 1.6) == "pedestrian"

@@ -145,16 +145,11 @@ def test_of_two_boxes_a_pixel_detects_that_of_the_nearer_center() -> None:
 
 @pytest.mark.parametrize("row", [(0, -10, 1, 4, 2, 1.6, 0), (100, 10, 1, 4, 2, 1.6, 0), (0, 10, 50, 4, 2, 1.6, 0)])
 def test_boxes_behind_the_camera_or_outside_teach_nothing(row: tuple[float, ...]) -> None:
-    found = targets(row)
-    assert not len(found.locations)
-    assert not found.ignored.any()
-
-
-def test_no_boxes_give_no_targets() -> None:
-    found = targets()
-    assert found.boxes.shape == (0, 8)
-    assert found.ignored.shape == (28 * 48 + 14 * 24 + 7 * 12,)
-    assert not found.ignored.any()
+    for found in (targets(row), targets()):
+        assert found.boxes.shape == (0, 8)
+        assert not len(found.locations)
+        assert found.ignored.shape == (28 * 48 + 14 * 24 + 7 * 12,)
+        assert not found.ignored.any()
 
 
 def test_a_box_centered_just_outside_is_detected_at_the_border() -> None:
@@ -219,14 +214,8 @@ def classed_boxes(*rows: tuple[str, float, float, float], num_points: list[int] 
 
 def test_boxes_out_of_range_class_or_points_are_no_targets(mini_config) -> None:
     config = replace(mini_config, classes=("car", "pedestrian"))
-    truth = classed_boxes(
-        ("pedestrian", 1, 2, 0),
-        ("car", 30, 0, 0),
-        ("bus", 0, 0, 0),
-        ("car", 5, 5, 0),
-        ("car", 6, 5, 0),
-        num_points=[3, 9, 9, -1, 0],
-    )
+    rows = [("pedestrian", 1, 2, 0), ("car", 30, 0, 0), ("bus", 0, 0, 0), ("car", 5, 5, 0), ("car", 6, 5, 0)]
+    truth = classed_boxes(*rows, num_points=[3, 9, 9, -1, 0])
     targets = detection_targets(truth, config)
     assert targets.labels.tolist() == [1, 0]
     assert targets.codes[:, :2].tolist() == [[1, 2], [5, 5]]
@@ -240,12 +229,8 @@ def test_a_vehicle_covers_the_cells_under_it() -> None:
     expected[0, 1:3, 4] = 1  # x 0 to 2, y -2 to 2
     assert torch.equal(targets.things, expected.flatten(1))
     assert targets.locations.tolist() == [pytest.approx([9 / 16, 0.5, 2 / 16, 4 / 8])]
-
-
-def test_a_vehicle_smaller_than_a_cell_covers_one() -> None:
-    bicycle = replace(classed_boxes(("bicycle", 0.2, 0.2, 0.3)), sizes_lwh=np.array([[0.5, 0.3, 1.0]]))
-    targets = segmentation_targets(bicycle, None, GRID)
-    assert targets.things.nonzero().tolist() == [[0, 2 * 8 + 4]]
+    small = replace(classed_boxes(("bicycle", 0.2, 0.2, 0.3)), sizes_lwh=np.array([[0.5, 0.3, 1.0]]))
+    assert segmentation_targets(small, None, GRID).things.nonzero().tolist() == [[0, 2 * 8 + 4]]
 
 
 def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
@@ -263,20 +248,14 @@ def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
     assert crossing.nonzero().tolist() == [[2, 0]]
 
 
-def test_a_map_smaller_than_the_grid_is_rejected() -> None:
-    with pytest.raises(InputError, match="covers x -6 to 6 m, but the model's BEV grid -8 to 8 m"):
-        segmentation_targets(Boxes3D.empty(), BevMap(np.zeros((4, 4), np.uint8), (-6, 6), (-4, 4)), GRID)
-
-
 def test_the_bits_of_a_map_are_those_that_it_states() -> None:
     cells = np.full((8, 16), 2, dtype=np.uint8)
     crossings = BevMap(cells, (-8, 8), (-4, 4), {"kerb": 1, "pedestrian_crossing": 2})
     stuff = segmentation_targets(Boxes3D.empty(), crossings, GRID).stuff
     assert stuff is not None
     assert stuff.any(dim=1).tolist() == [False, False, True]
-
-
-def test_a_map_without_any_class_of_the_head_is_rejected() -> None:
     kerbs = BevMap(np.zeros((8, 16), np.uint8), (-8, 8), (-4, 4), {"kerb": 1})
     with pytest.raises(InputError, match="has the classes kerb, but the segmentation head learns drivable_road"):
         segmentation_targets(Boxes3D.empty(), kerbs, GRID)
+    with pytest.raises(InputError, match="covers x -6 to 6 m, but the model's BEV grid -8 to 8 m"):
+        segmentation_targets(Boxes3D.empty(), BevMap(np.zeros((4, 4), np.uint8), (-6, 6), (-4, 4)), GRID)

@@ -92,6 +92,9 @@ def test_every_other_tensor_is_that_of_the_file(source: Path) -> None:
     row = 2 * (32 + 1)  # of a class: weights and a bias of each of two layers
     assert (start.numbers("new"), start.numbers("unused")) == (row, row)
     assert start.numbers("loaded") + row == sum(tensor.numel() for tensor in model.state_dict().values())
+    with safetensors.safe_open(source, framework="pt") as file:
+        facts = {key: json.loads(file.metadata()[key]) for key in ("classes", "cameras")}
+    assert facts == {"classes": ["car", "pedestrian", "barrier"], "cameras": ["CAM_FRONT", "CAM_BACK"]}
 
 
 def test_cameras_of_other_names_take_the_nearest_view(source: Path) -> None:
@@ -118,9 +121,6 @@ def test_parts_that_only_one_model_has_are_listed(source: Path) -> None:
     start = warm_start(source, own_model(decoder=decoder), "own.toml", NO_RIG)
     assert "another shape in the file (decoder.query_embedding: 12 × 64 and 15 × 64)" in start.table()
     assert "not in the model (decoder.layers.1." in start.table()
-
-
-def test_fewer_object_queries_are_the_first_of_the_file(source: Path) -> None:
     model = own_model(decoder=replace(small_config().decoder, queries=9))
     start = warm_start(source, model, "own.toml", NO_RIG)
     assert torch.equal(model.decoder.query_embedding, tensors(source)["decoder.query_embedding"][:9])
@@ -161,13 +161,6 @@ def test_wrong_names_in_the_metadata_are_no_traceback(stated: str, tmp_path: Pat
     path = tmp_path / "odd.safetensors"
     safetensors.torch.save_file(small_model(1).state_dict(), path, {"classes": stated, "cameras": stated})
     assert isinstance(warm_start(path, own_model(), "own.toml", OneRig(RIG)), WarmStart)
-
-
-def test_saved_weights_name_their_classes_and_cameras(source: Path) -> None:
-    with safetensors.safe_open(source, framework="pt") as file:
-        facts = file.metadata()
-    assert json.loads(facts["classes"]) == ["car", "pedestrian", "barrier"]
-    assert json.loads(facts["cameras"]) == ["CAM_FRONT", "CAM_BACK"]
 
 
 def test_a_run_notes_classes_of_other_names() -> None:

@@ -69,17 +69,11 @@ def test_images_of_an_untrained_model_say_so(prediction):
     warning = (random == (85, 70, 255)).all(-1)
     assert warning[150:].sum() > 20
     assert not (trained == (85, 70, 255)).all(-1).any()
-
-
-def test_a_plot_in_rgb_has_the_channels_reversed(prediction):
     assert np.array_equal(prediction.plot(color_order="rgb"), prediction.plot()[..., ::-1])
-
-
-def test_a_missing_image_leaves_its_place_dark(prediction):
     frame = prediction.frame
     kept = {name: image for name, image in frame.images.items() if name != "CAM_FRONT"}
     image = replace(prediction, frame=replace(frame, images=kept)).plot("CAM_FRONT")
-    assert (image[-20:] == (25, 20, 18)).all()
+    assert (image[-20:] == (25, 20, 18)).all()  # a missing image leaves its place dark
     assert not of_color(image, "car").any()
 
 

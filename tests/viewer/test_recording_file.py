@@ -57,6 +57,9 @@ def test_a_file_that_is_not_a_recording_is_an_error_of_one_line(tmp_path, conten
         pass
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+    for other, said in ((tmp_path / "none.rrd", "no such recording"), (tmp_path, "folder")):
+        with pytest.raises(InputError, match=said), open_recording(other):
+            pass
 
 
 @pytest.mark.parametrize("bev", ["pca", pytest.param("none", marks=pytest.mark.slow)])
@@ -109,13 +112,6 @@ def test_a_killed_recording_keeps_its_frames(tmp_path):
     with open_recording(path) as file:
         assert file != path
         assert len(list(RecordingReader(file).frames())) == finished
-
-
-def test_a_missing_file_and_a_folder_without_recording_fail(tmp_path):
-    with pytest.raises(InputError, match="no such recording"), open_recording(tmp_path / "none.rrd"):
-        pass
-    with pytest.raises(InputError, match="folder"), open_recording(tmp_path):
-        pass
 
 
 @pytest.mark.parametrize(

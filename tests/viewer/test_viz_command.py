@@ -73,12 +73,9 @@ def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
 
 @pytest.mark.parametrize(
     ("ending", "with_av", "codecs"),
-    [
-        pytest.param("mp4", True, (b"h264", b"avc1"), marks=pytest.mark.slow),
-        pytest.param("mp4", False, (b"vp09", b"vp90"), marks=pytest.mark.slow),
-        pytest.param("webm", True, (b"vp90", b"vp09"), marks=pytest.mark.slow),
-    ],
+    [("mp4", True, (b"h264", b"avc1")), ("mp4", False, (b"vp09", b"vp90")), ("webm", True, (b"vp90", b"vp09"))],
 )
+@pytest.mark.slow
 def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, ending, with_av, codecs):
     if with_av and not video.has_av():
         pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
@@ -127,30 +124,17 @@ def test_a_video_of_av1_images_shows_them(tmp_path):
     assert first[1].std() > 0.5 * first[0].std()
 
 
-def test_the_folder_of_a_run_stands_for_its_recording(drive, tmp_path):
-    _, path = drive
-    assert viz(path.parent, "--summary") == viz(path, "--summary")
-    with pytest.raises(InputError, match=r"the folder has no recording\.rrd"):
-        viz(tmp_path, "--summary")
-
-
-def test_a_cut_off_recording_is_shown_with_a_note(drive, tmp_path):
+def test_folders_and_cut_recordings_are_shown_and_wrong_requests_told(drive, tmp_path):
     _, path = drive
     cut = tmp_path / "cut.rrd"
     cut.write_bytes(path.read_bytes()[:-5000])
-    text = viz(cut, "--summary")
-    assert text.startswith(f"note: {cut} is incomplete")
-
-
-def test_unknown_endings_are_refused(drive, tmp_path):
-    _, path = drive
+    assert viz(cut, "--summary").startswith(f"note: {cut} is incomplete")
     with pytest.raises(InputError, match="must end in"):
         viz(path, "--video", tmp_path / "x.avi")
-
-
-def test_a_frame_of_a_summary_is_a_usage_error(drive):
-    result = CliRunner().invoke(app, ["viz", str(drive[1]), "--frame", "1", "--summary"])
-    assert result.exit_code == 2
+    assert CliRunner().invoke(app, ["viz", str(path), "--frame", "1", "--summary"]).exit_code == 2
+    assert viz(path.parent, "--summary") == viz(path, "--summary")
+    with pytest.raises(InputError, match=r"the folder has no recording\.rrd"):
+        viz(tmp_path, "--summary")
 
 
 def test_a_video_of_the_images_has_them_and_their_boxes_alone(tmp_path):
