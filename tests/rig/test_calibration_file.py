@@ -30,7 +30,7 @@ def same(a: CameraRig, b: CameraRig) -> bool:
 
 
 @pytest.mark.parametrize("name", HEALTHY)
-def test_the_numbers_are_those_of_the_file(name, tmp_path):
+def test_the_numbers_are_those_of_the_file_to_the_last_bit(name, tmp_path):
     document = copy_of(name)
     rig = read_calibration(written(document, tmp_path))
     assert rig.names == tuple(document["cameras"])
@@ -40,16 +40,12 @@ def test_the_numbers_are_those_of_the_file(name, tmp_path):
         assert (camera.width, camera.height) == (entry["width"], entry["height"])
         assert camera.intrinsics.tolist() == entry["intrinsics"]
         assert camera.ego_from_camera[:3, 3].tolist() == entry["ego_from_camera"]["translation"]
-        np.testing.assert_allclose(
-            camera.ego_from_camera[:3, :3], Rotation.from_quat([x, y, z, w]).as_matrix(), atol=1e-14
-        )
-
-
-@pytest.mark.parametrize("name", HEALTHY)
-def test_a_written_rig_is_read_again_to_the_last_bit(name, tmp_path):
-    rig = read_calibration(written(copy_of(name), tmp_path))
+        rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
+        np.testing.assert_allclose(camera.ego_from_camera[:3, :3], rotation, atol=1e-14)
     write_calibration(tmp_path / "again.json", rig)
     assert same(read_calibration(tmp_path / "again.json"), rig)
+    with pytest.raises(OutputError, match="no-such-folder"):
+        write_calibration(tmp_path / "no-such-folder" / "calibration.json", rig)
 
 
 def test_a_rotation_may_be_a_matrix(tmp_path):
@@ -184,14 +180,8 @@ def test_a_mistake_is_one_line_that_names_file_and_place(name, tmp_path):
     assert line.startswith(f"{path}: ")
     assert "\n" not in line
     assert re.search(pattern, line), line
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-def test_the_lenient_reader_finds_the_same_keeps_other_cameras(name, tmp_path):
-    spoil, pattern = MISTAKES[name]
-    document = copy_of("six")
-    spoil(document)
-    draft = draft_calibration(written(document, tmp_path))
+    # The lenient reader finds the same, and keeps the other cameras.
+    draft = draft_calibration(path)
     assert any(re.search(pattern, finding.line) for finding in errors_of(draft.findings))
     if isinstance(document.get("cameras"), dict) and document["cameras"]:
         assert set(draft.rig.names) >= set(document["cameras"]) - {"CAM_BACK"}
@@ -222,16 +212,7 @@ def test_what_is_no_json_object_is_refused(read, text, pattern, tmp_path):
     path = written(text, tmp_path)
     with pytest.raises(InputError, match=pattern):
         read(path)
-
-
-def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "nothing.json", tmp_path, tmp_path / "bytes"):
         with pytest.raises(InputError, match=re.escape(str(path))):
-            read_calibration(path)
-
-
-def test_a_place_that_cannot_be_written_is_said(tmp_path):
-    rig = read_calibration(written(copy_of("six"), tmp_path))
-    with pytest.raises(OutputError, match="no-such-folder"):
-        write_calibration(tmp_path / "no-such-folder" / "calibration.json", rig)
+            read(path)

@@ -154,12 +154,9 @@ def test_another_run_is_not_resumed_and_the_difference_is_named(model, mini_mode
         run_all(Model(mini_model), interrupted, resume=True)
     with pytest.raises(OutputError, match="exclude each other"):
         run_all(model, interrupted, resume=True, force=True)
-    assert contents(interrupted) == before
-
-
-def test_an_interrupted_run_is_not_overwritten_unasked(model, interrupted):
     with pytest.raises(OutputError, match="`resume=True`"):
         run_all(model, interrupted)
+    assert contents(interrupted) == before
 
 
 def test_a_broken_state_is_an_error_of_one_line(model, interrupted):
@@ -184,14 +181,11 @@ def test_force_removes_only_what_a_run_wrote(model, tmp_path):
     run_all(model, out, MadeDrive(2), force=True)
     assert all(path.read_text() == "mine" for path in kept)
     assert {path.name for path in out.glob("segmentation/00000*.png")} == {"000000.png", "000001.png"}
-
-
-def test_a_file_that_no_run_wrote_is_not_overwritten(model, tmp_path):
-    (tmp_path / "out/segmentation").mkdir(parents=True)
-    mine = tmp_path / "out/segmentation/000000.png"
+    mine = tmp_path / "other/segmentation/000000.png"
+    mine.parent.mkdir(parents=True)
     mine.write_text("mine")
     with pytest.raises(OutputError, match=r"000000\.png: exists already, and no run wrote it"):
-        run_all(model, tmp_path / "out", force=True)
+        run_all(model, tmp_path / "other", force=True)
     assert mine.read_text() == "mine"
 
 
@@ -242,16 +236,15 @@ def test_cut_files_are_named_and_left_alone(model, interrupted):
 
 
 def test_pipes_and_devices_in_place_of_files_are_not_waited_for(model, interrupted):
+    path, calibration = interrupted / "segmentation/000001.png", interrupted / "calibration.json"
+    content = path.read_bytes()
     for replaced in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
-        path = interrupted / "segmentation/000001.png"
         path.unlink()
         replaced(path)
         with pytest.raises(OutputError, match=r"000001.png: `resume` .*: was cut or removed"):
             run_all(model, interrupted, resume=True)
-
-
-def test_a_pipe_in_place_of_the_calibration_is_replaced(model, interrupted):
-    calibration = interrupted / "calibration.json"
+    path.unlink()
+    path.write_bytes(content)
     calibration.unlink(missing_ok=True)
     os.mkfifo(calibration)
     run_all(model, interrupted, resume=True)
