@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from same_world import outside_of_boxes
 
 from bevcli.config import load_config
 from bevcli.frame import CameraImage, Frame
@@ -75,21 +75,8 @@ def test_boxes_contain_their_pixels_where_the_body_pitches(moving, pitched):
     """As they do on a still body: with the true pose. With a level one they are off."""
     true = pitched.world_from_ego
     level = Pose.from_matrix(rigid(true.translation, rotation_about_z(true.yaw)))
-    states = [state for _, state in moving._actors(PITCHED)]
-    rows = {instance: k for k, instance in enumerate(pitched.boxes.instances)}
-    outside: dict[str, list[float]] = {"true": [], "level": []}
-    for name, view in pitched.views.items():
-        for index in np.unique(view.objects[view.objects >= 0]):
-            row = rows.get(states[index].body.instance)
-            if row is None:
-                continue
-            corners, seen = pitched.boxes.corners()[row], np.argwhere(view.objects == index)[:, ::-1]
-            for kind, pose in (("true", true), ("level", level)):
-                pixels, depth = moving.rig[name].project_ego(apply(inverse(pose.matrix), corners))
-                if depth.min() > 0.3:
-                    hull = cv2.convexHull(pixels.astype(np.float32))
-                    distances = [cv2.pointPolygonTest(hull, tuple(map(float, pixel)), True) for pixel in seen]
-                    outside[kind].append(min(distances))
+    poses = {"true": true, "level": level}
+    outside = {kind: outside_of_boxes(moving, PITCHED, pitched, pose) for kind, pose in poses.items()}
     assert len(outside["true"]) > 20
     assert min(outside["true"]) > -0.6
     assert min(outside["level"]) < -2

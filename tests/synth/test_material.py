@@ -63,7 +63,6 @@ def varied(folder: Path, assets: Assets) -> RenderedDrive:
 @pytest.mark.slow
 def test_a_drive_with_material_is_the_same_each_time(varied: RenderedDrive, folder: Path, assets: Assets) -> None:
     image(varied, 0)
-
     np.testing.assert_array_equal(image(drive(assets, folder), 1), image(varied, 1))
 
 
@@ -72,7 +71,6 @@ def test_the_sky_of_a_drive_is_the_photograph(varied: RenderedDrive) -> None:
     pixels = image(varied, 0)[:8].reshape(-1, 3)
     colors, counts = np.unique(pixels, axis=0, return_counts=True)
     blue, green, red = colors[counts.argmax()]
-
     assert counts.max() > 0.1 * len(pixels)
     assert red > blue > green + 30
 
@@ -85,7 +83,6 @@ def test_what_is_not_drawn_anew_stays_in_place(varied: RenderedDrive, assets: As
     before, after = (
         frame.boxes[[list(frame.boxes.instances).index(name) for name in same]] for frame in (plain, with_material)
     )
-
     assert len(same) > 3
     assert (plain.images["CAM_FRONT"] != with_material.images["CAM_FRONT"]).mean() > 0.3
     np.testing.assert_array_equal(before.centers, after.centers)
@@ -98,7 +95,6 @@ def test_textures_repeat_and_keep_their_aspect(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "textures/facade-stripes.png"), np.full((4, 12, 3), 85, np.uint8))
     textures = MaterialFolder.read(str(tmp_path)).textures
     facade = textures.of_kind["facade"][0]
-
     assert textures.aspects[facade] == 3
     assert (textures.texels[facade] == 85).all()
     assert textures.texels.shape[1] == sum(4**level for level in range(1, 9))
@@ -108,7 +104,6 @@ def test_paint_of_a_model_is_the_color_of_the_individual(folder: Path) -> None:
     model = MaterialFolder.read(str(folder)).models["car"][0]
     color, dye = np.array([0.8, 0.4, 0.2], np.float32), np.zeros(3, np.float32)
     soup = TriangleSoup.from_mesh(model.poses[0]).painted(color, dye, model.shaded)
-
     np.testing.assert_allclose(soup.albedo, np.tile(color / 2, (12, 1)))
     np.testing.assert_allclose(model.size_lwh, (4.4, 1.8, 1.4), rtol=1e-6)
 
@@ -116,7 +111,6 @@ def test_paint_of_a_model_is_the_color_of_the_individual(folder: Path) -> None:
 def test_models_replace_a_share_of_their_class(folder: Path, assets: Assets) -> None:
     more = replace(assets, models=MaterialFolder.read(str(folder)).models)
     random, same = np.random.default_rng(1), np.random.default_rng(1)
-
     assert 0.55 < np.mean([more.draw("car", random).shaded for _ in range(300)]) < 0.75
     random = np.random.default_rng(1)
     for class_name in ("truck", "pedestrian", "car"):
@@ -129,22 +123,11 @@ def test_standing_people_are_standing_models(tmp_path: Path, assets: Assets) -> 
     write_model(write_model(tmp_path, "pedestrian-a"), "pedestrian-b_standing")
     more, random = replace(assets, models=MaterialFolder.read(str(tmp_path)).models), np.random.default_rng(0)
     drawn = {n: {more.draw("pedestrian", random, [n]).name for _ in range(50)} for n in ("man", "man_standing")}
-
     assert drawn == {"man": {"man", "a"}, "man_standing": {"man_standing", "b_standing"}}
-
-
-def test_the_densities_of_drives_differ() -> None:
-    drawn = [draw_density(np.random.default_rng(seed)) for seed in range(30)]
-
-    assert {d.vehicles > Density().vehicles + 15 for d in drawn} == {True, False}
-    for density in drawn:
-        assert sum(density.traffic.values()) == pytest.approx(1)
-        assert sum(density.parked.values()) == pytest.approx(1)
 
 
 def test_only_used_material_changes_the_digest(tmp_path: Path) -> None:
     one, other = write_sky(tmp_path / "a"), write_model(write_sky(tmp_path / "b"))
-
     assert RigDistribution().digest == "e360a40a"
     with pytest.raises(ValueError, match="varied_share must be above 0"):
         RigDistribution(material=str(one))
@@ -153,14 +136,14 @@ def test_only_used_material_changes_the_digest(tmp_path: Path) -> None:
     assert len({*digests, "cbb7af2d"}) == 3
     rigs = [draw_rig(RigDistribution(varied_share=0.5, material="m"), seed, (96, 54)) for seed in range(20)]
     assert {(rig.varied, rig.material) for rig in rigs} == {(True, "m"), (False, "")}
-
-
-@pytest.mark.parametrize("name", ["missing", "empty"])
-def test_a_folder_without_material_is_an_error(name: str, tmp_path: Path) -> None:
     (tmp_path / "empty/models").mkdir(parents=True)
-
-    with pytest.raises(InputError, match=rf"{name}: .*expected models/\*-\*.npz"):
-        _ = RigDistribution(varied_share=1.0, material=str(tmp_path / name)).digest
+    for name in ("missing", "empty"):
+        with pytest.raises(InputError, match=rf"{name}: .*expected models/\*-\*.npz"):
+            _ = RigDistribution(varied_share=1.0, material=str(tmp_path / name)).digest
+    drawn = [draw_density(np.random.default_rng(seed)) for seed in range(30)]
+    assert {d.vehicles > Density().vehicles + 15 for d in drawn} == {True, False}
+    for density in drawn:
+        assert [sum(each.values()) for each in (density.traffic, density.parked)] == pytest.approx([1, 1])
 
 
 @pytest.mark.parametrize(
@@ -176,7 +159,6 @@ def test_a_folder_without_material_is_an_error(name: str, tmp_path: Path) -> Non
 )
 def test_a_wrong_model_is_an_error(name: str, changes: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     write_model(tmp_path, name, **changes)
-
     with pytest.raises(InputError, match=message):
         MaterialFolder.read(str(tmp_path))
 
