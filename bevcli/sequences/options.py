@@ -150,8 +150,9 @@ def _number(text: str) -> float:
     return value
 
 
+RigAngles: TypeAlias = Literal["wxyz", "xyzw", "vector", "radians", "degrees", "clockwise", "clockwise-radians"]
 PoseAngles: TypeAlias = Literal[
-    "degrees", "radians", "compass", "compass-radians", "clockwise", "clockwise-radians", "wxyz", "xyzw"
+    "degrees", "radians", "compass", "compass-radians", "clockwise", "clockwise-radians", "vector", "wxyz", "xyzw"
 ]
 
 
@@ -186,10 +187,10 @@ class RigOptions:
         help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
         "up, z backward (opengl); the same, z forward (unity); x forward, y right, z up (unreal).",
     )
-    rig_angles: Literal["wxyz", "xyzw", "vector", "radians", "degrees"] | None = option(
+    rig_angles: RigAngles | None = option(
         default=None,
         help="What the numbers of a rotation in --calibration are: a quaternion, a rotation vector, or roll, pitch and "
-        "yaw.",
+        "yaw, also clockwise.",
     )
     rig_unit: Literal["m", "cm", "mm", "in", "ft"] | None = option(
         default=None, help="Unit of the translations in --calibration. Default: the one that gives a vehicle."
@@ -232,7 +233,8 @@ class RigOptions:
     pose_angles: PoseAngles | None = option(
         default=None,
         help="Angles in --ego-motion: radians or degrees, compass or compass-radians (clockwise from north), clockwise "
-        "or clockwise-radians (from x); or the order of its quaternions, wxyz or xyzw. Default: what the images show.",
+        "or clockwise-radians (from x), or vector; or the order of its quaternions, wxyz or xyzw. Default: what the "
+        "images show.",
         metavar="ANGLES",
     )
     pose_unit: Literal["m", "cm", "mm", "ft"] | None = option(

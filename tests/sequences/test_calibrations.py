@@ -95,6 +95,13 @@ SPELLINGS = {
         "dist_coeffs": [D],
         "T_vehicle_camera": {"rows": 4, "cols": 4, "data": pose(name).ravel().tolist()},
     },
+    "by column, P, shares": lambda name: {
+        "P": np.c_[k_of(name) / [[800], [450], [1]], np.zeros(3)].tolist(),
+        "width": 800,
+        "height": 450,
+        "D": D,
+        "T": pose(name).T.tolist(),
+    },
     "quaternion": lambda name: entry(
         name,
         pose={

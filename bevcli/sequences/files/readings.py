@@ -18,11 +18,12 @@ LEFT_HANDED = ("ruf", "fru")  # of Unity and Unreal
 CAMERA_AXES = {"optical": "rdf", "vehicle": "flu", "opengl": "rub", "unity": "ruf", "unreal": "fru"}
 ORDERS = {order: f"quaternion {' '.join(order)}" for order in ("wxyz", "xyzw")}
 ANGLES = {"vector": "rotation vectors"} | {unit: f"roll, pitch and yaw in {unit}" for unit in ("radians", "degrees")}
+ANGLES |= {"clockwise": f"{ANGLES['degrees']}, clockwise", "clockwise-radians": f"{ANGLES['radians']}, clockwise"}
 POSE_ANGLES = {unit: f"yaw in {unit} counter-clockwise from x" for unit in ("radians", "degrees")} | {
     "compass": "heading in degrees clockwise from north", "compass-radians": "heading in radians clockwise from north",
     "clockwise": "yaw in degrees clockwise from x", "clockwise-radians": "yaw in radians clockwise from x",
 }  # fmt: skip
-WORDS = {"rig_angles": ORDERS | ANGLES, "pose_angles": ORDERS | POSE_ANGLES}
+WORDS = {"rig_angles": ORDERS | ANGLES, "pose_angles": ORDERS | POSE_ANGLES | {"vector": ANGLES["vector"]}}
 
 
 def ego_from_axes(letters: str) -> Array:

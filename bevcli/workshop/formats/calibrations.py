@@ -45,6 +45,7 @@ OPEN_LENS = (
     "state distortion_model: fisheye beside them"
 )
 HIGHEST_M = 10.0  # of a camera that is stated
+LARGEST_SHARE = 5.0  # of a focal length, in sizes of the image; in pixels it is larger
 
 
 def read_rig(
@@ -172,7 +173,10 @@ def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, dri
     sides = {key: int(value) if isinstance(value, float) and value.is_integer() else value
              for key, value in zip(("width", "height"), size, strict=True)}  # fmt: skip
     pose = {"ego_from_camera": transform_to_json(ego_from_camera)}
-    return {**sides, "intrinsics": of.intrinsics, "distortion": of.distortion, **pose}
+    matrix = np.array(of.intrinsics)
+    if matrix[:2].max() < LARGEST_SHARE and all(isinstance(side, int) for side in sides.values()):
+        matrix[:2] *= np.array([[sides["width"]], [sides["height"]]])
+    return {**sides, "intrinsics": matrix.tolist(), "distortion": of.distortion, **pose}
 
 
 def _named_as_images(cameras: Cameras, drive: Path | None) -> Cameras:

@@ -22,9 +22,9 @@ from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats.camera_poses import Cameras, StatedCamera, StatedPose
 from bevcli.workshop.formats.name_times import read_times
-from bevcli.workshop.formats.named_calibration import number_of
 from bevcli.workshop.formats.other_calibrations import lines_of
 from bevcli.workshop.formats.pose_readings import product, quaternions_of_angles, rotated
+from bevcli.workshop.formats.pose_table import number_of
 
 KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt")
 # The Velodyne is 0.76 m ahead of the rear axle and 1.73 m above the road (the data set's drawing of the vehicle).

@@ -24,11 +24,12 @@ from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, Sta
 from bevcli.workshop.formats.dialects import urdf_document, with_intrinsics_by_name, with_own_names
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
 from bevcli.workshop.formats.pose_readings import quaternions_of_angles
+from bevcli.workshop.formats.pose_table import number_of
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
 INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
-              "camintrinsic", "projectionparameters")  # fmt: skip
+              "camintrinsic", "projectionparameters", "p", "projectionmatrix")  # fmt: skip
 LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
         "distortionparameters")  # fmt: skip
 LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
@@ -108,14 +109,6 @@ def _from_xml(element: Element, path: Path) -> Any:
         tag = children[twice].tag
         raise InputError(f'{path}: "{tag:.60}" appears twice in <{element.tag:.60}>: remove or rename one')
     return {child.tag: _from_xml(child, path) for child in children}
-
-
-def number_of(word: str) -> float | None:
-    """The number that a word is; None for another word."""
-    try:
-        return float(word)
-    except ValueError:
-        return None
 
 
 def cameras_of(document: Any, path: Path) -> Cameras:
@@ -206,8 +199,8 @@ def _camera_matrix(value: Any, entry: Mapping[str, Any], where: str) -> Any:
     if array is not None and array.shape == (4,):
         fx, fy, cx, cy = require(parse_numbers, {"intrinsics": value}, "intrinsics", (4,), where=where).tolist()
         return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-    if array is not None and array.size == 9:
-        value = array.reshape(3, 3).tolist()
+    if array is not None and array.size in (9, 12):  # the latter projects, as ROS's P
+        value = array.reshape(3, -1)[:, :3].tolist()
     return require(parse_numbers, {"intrinsics": value}, "intrinsics", (3, 3), where=where).tolist()
 
 
@@ -310,6 +303,8 @@ def _matrices(value: Any) -> dict[str, Array]:
         return {}
     matrix = np.eye(4)
     matrix[: array.size // 4] = array.reshape(-1, 4)
+    if array.size == 16 and not matrix[:3, 3].any() and matrix[3, :3].any():  # column by column
+        matrix = matrix.T
     return {"": matrix} if np.allclose(matrix[3], [0, 0, 0, 1]) else {}
 
 
@@ -351,7 +346,10 @@ def _rotations_of_three(name: str, numbers: Array) -> dict[str, Array]:
     if largest <= LARGEST_RADIANS and name not in ("rpy", "euler", "eulerangles"):
         rotations["vector"] = np.asarray(cv2.Rodrigues(numbers)[0], dtype=np.float64)
     if name not in ("rvec", "r"):
-        for unit, angles in (("radians", numbers), ("degrees", np.radians(numbers))):
-            if largest <= LARGEST_RADIANS or unit == "degrees":
+        mirrored = numbers * [1, -1, -1]  # pitch and yaw
+        kinds = [("radians", numbers), ("degrees", np.radians(numbers))]
+        kinds += [("clockwise-radians", mirrored), ("clockwise", np.radians(mirrored))]
+        for unit, angles in kinds:
+            if largest <= LARGEST_RADIANS or "radians" not in unit:
                 rotations[unit] = rotation_from_quaternion(quaternions_of_angles(*angles[:, None])[0])
     return rotations

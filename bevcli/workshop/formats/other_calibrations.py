@@ -26,8 +26,8 @@ from bevcli.workshop.formats.named_calibration import (
     files_in,
     lens_fields,
     lens_of,
-    number_of,
 )
+from bevcli.workshop.formats.pose_table import number_of
 
 LARGEST_TEXT = 64 * MIB
 NO_CAMERA = ("", ".", "images")  # folders that are not named after a camera

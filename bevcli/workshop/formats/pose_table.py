@@ -22,6 +22,25 @@ from bevcli.workshop.formats.markup import parse_xml
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # world_from_camera, row by row
 TUM = ("time", *VECTOR, "qx", "qy", "qz", "qw")
+ROTATION_VECTOR = ("rx", "ry", "rz")
+LAST_ROW = ("m30", "m31", "m32", "m33")
+# The columns of tables without names: those of which the rotations are some are taken, the first of several.
+UNNAMED = [
+    (*time, *columns)
+    for columns in (
+        (*VECTOR, "qx", "qy", "qz", "qw"),
+        (*VECTOR, *QUATERNION),
+        (*QUATERNION, *VECTOR),
+        ("qx", "qy", "qz", "qw", *VECTOR),
+        MATRIX,
+        [f"m{row}{column}" for column in range(4) for row in range(3)],
+        (*MATRIX, *LAST_ROW),
+        [f"m{row}{column}" for column in range(4) for row in range(4)],
+    )
+    for time in ((), ("time",))
+]
+EUROC = ("time", *VECTOR, *QUATERNION)  # and velocities and biases, which are left out
+ROTATION_TOLERANCE = 0.01  # of the norm of a quaternion, and of the products of a matrix's rows
 BLOCK = 65_536  # rows whose places in the text are made numbers at once
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _UNIT = "(?:_(?:m|mm|cm|km|s|sec|seconds|ms|us|ns|deg|degrees|rad|radians))?"
@@ -39,6 +58,8 @@ NAMES = {
     "down": rf"(?:pos_|ned_)?down{_LENGTH}|(?:pos|ned)_d{_LENGTH}",
     **{f"q{axis}": rf"q_?{axis}|q_\w+_{axis}|{_OF}(?:quat|quaternion|orientation|rotation|rot)[._]?{axis}"
        for axis in "wxyz"},
+    **{f"r{axis}": rf"r{axis}|(?:rot|rotation|rotation_?vector|rot_?vec|r_?vec|axis_?angle)[._]?{axis}"
+       for axis in "xyz"},
     "latitude": rf"{_OF}lat(?:itude)?{_UNIT}",
     "longitude": rf"{_OF}(?:lon|lng|long|longitude){_UNIT}",
     "altitude": rf"{_OF}(?:alt|altitude|elevation|ele|height){_UNIT}",
@@ -154,9 +175,8 @@ def read_table(path: Path) -> Table | None:
     names = names if len(names) == count else re.split(r"[,;\s]+", header)
     places = _columns(path, names) if len(names) == count else {}
     if len(places) < 2:
-        unnamed = {12: MATRIX, 8: TUM}.get(count, ())
-        if separator == "," and count in (8, 17):  # EuRoC's own order
-            unnamed = ("time", *VECTOR, *QUATERNION)
+        rows = [text[start:end] for _, start, end in np.reshape(spans, (-1, 3))[[0, len(spans) // 6, -1]].tolist()]
+        unnamed = _unnamed([[number_of(cell) for cell in _cells(row, separator)] for row in rows], separator)
         places, names = {quantity: index for index, quantity in enumerate(unnamed)}, [""] * count
     if not places:
         return None
@@ -167,6 +187,38 @@ def read_table(path: Path) -> Table | None:
             number = table.spans[index, 0]
             raise InputError(f"{path}: line {number} has {found} cells (expected {count}, as in the first row)")
     return table
+
+
+def _unnamed(rows: list[list[float | None]], separator: str | None) -> Sequence[str]:
+    """The columns of a table without names, by some of its rows; none where their number is not known."""
+    count = len(rows[0])
+    if separator == "," and count in (8, 17):  # EuRoC's own order goes before that of TUM
+        possible = [EUROC, *UNNAMED]
+    else:
+        possible = UNNAMED
+    possible = [columns for columns in possible if len(columns) == count or (columns is EUROC and count == 17)]
+    return next((columns for columns in possible if all(_is_rotation(columns, row) for row in rows)),
+                next(iter(possible), ()))  # fmt: skip
+
+
+def _is_rotation(columns: Sequence[str], row: Sequence[float | None]) -> bool:
+    """True where the numbers of a row are those of a rotation."""
+    if len(row) < len(columns) or None in row:
+        return False
+    numbers = dict(zip(columns, np.array(row, np.float64), strict=False))
+    if "qw" in columns:
+        return bool(abs(np.linalg.norm([numbers[name] for name in QUATERNION]) - 1) < ROTATION_TOLERANCE)
+    matrix = np.reshape([numbers[name] for name in MATRIX], (3, 4))[:, :3]
+    last = [numbers.get(name, float(name == "m33")) for name in LAST_ROW]
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() < ROTATION_TOLERANCE and last == [0, 0, 0, 1])
+
+
+def number_of(word: str) -> float | None:
+    """The number that a word is; None for another word."""
+    try:
+        return float(word)
+    except ValueError:
+        return None
 
 
 def read_column(path: Path, quantity: str) -> Table:

@@ -12,13 +12,14 @@ from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.parsing.documents import CsvRow
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.pose_readings import product
-from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, VECTOR, Table
+from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, ROTATION_VECTOR, VECTOR, Table
 
 LENGTH = re.compile(r"[_\[( ](mm|cm|km)\b")
 METRES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}
 NO_FIX = ("", "0", "no", "none", "false", "nofix", "no fix", "nan")
 ENU_FROM_NED = np.array([[0.0, 0.5**0.5, 0.5**0.5, 0.0]])  # quaternions w, x, y, z
 FRD_FROM_FLU = np.array([[0.0, 1.0, 0.0, 0.0]])
+HIGHEST_M = 9000.0  # of an altitude in metres
 NEAR_ZERO = 0.1  # latitude and longitude: places of a simulator in degrees, none on land in radians
 AGREE = 1.2  # ratio of two distances that are the same
 COURSE_M = 2.0  # between two positions, whose direction is the course
@@ -27,7 +28,10 @@ MOVING_M = 5.0  # shorter ways show no course
 
 def in_usual_units(table: Table, stated: RigOptions) -> Table:
     """The table in metres and degrees, with z up, without rows that have no fix. Raises InputError."""
-    table = _radians_as_degrees(_with_fix(table), stated)
+    table = _radians_as_degrees(_of_integers(_with_fix(table)), stated)
+    if table.has(*ROTATION_VECTOR) and not table.has("yaw"):
+        angles = table.numbers(*ROTATION_VECTOR).T
+        table = with_numbers(table, dict(zip(("roll", "pitch", "yaw"), angles, strict=True)), "rz")
     scales = {axis: METRES[found[1]] for axis in (*VECTOR, "down", "altitude")
               if (found := LENGTH.search(table.columns.get(axis, "")))}  # fmt: skip
     if scales:
@@ -70,6 +74,17 @@ def _has_fix(row: CsvRow) -> bool:
     if any(cell in ("", "nan") for cell in place) or row.cells.get("fix", "3").strip().lower() in NO_FIX:
         return False
     return any(cell.strip("0.+-") for cell in place) and row.cells.get("status", "0").strip() != "-1"
+
+
+def _of_integers(table: Table) -> Table:
+    """The table with places in degrees and metres, where they are integers, 1e-7 degrees and millimetres (MAVLink)."""
+    if not table.has("latitude", "longitude") or np.abs(places := table.numbers("latitude", "longitude")).max() < 1e6:
+        return table
+    latitude, longitude = places.T * 1e-7
+    columns = {"latitude": latitude, "longitude": longitude}
+    if table.has("altitude") and np.abs(altitudes := table.numbers("altitude")[:, 0]).max() > HIGHEST_M:
+        columns["altitude"] = altitudes * 1e-3
+    return replace(with_numbers(table, columns), notes=(*table.notes, "latitude and longitude in 1e-7 degrees"))
 
 
 def _radians_as_degrees(table: Table, stated: RigOptions) -> Table:

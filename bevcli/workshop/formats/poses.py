@@ -17,6 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import CameraRig
@@ -39,17 +40,26 @@ from bevcli.workshop.formats.pose_readings import (
     of_ego,
     quaternions_of_angles,
 )
-from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, TUM, VECTOR, Table, read_column, read_table
+from bevcli.workshop.formats.pose_table import (
+    MATRIX,
+    QUATERNION,
+    ROTATION_TOLERANCE,
+    ROTATION_VECTOR,
+    TUM,
+    VECTOR,
+    Table,
+    read_column,
+    read_table,
+)
 from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 _DIGITS = re.compile(r"(\d{1,18})(?:\.(\d{0,18}))?", re.ASCII)  # a time with all of its digits
 POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
-ANGLES = ("radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
+ANGLES = ("vector", "radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # those of feet are stated
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
-ROTATION_TOLERANCE = 0.01  # of the products of a matrix's rows
 
 
 def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
@@ -98,7 +108,8 @@ def _kind(table: Table) -> str:
     """The kind of a file of poses; "" for one that is not known."""
     order = table.columns.get("qw")
     kinds = {
-        "KITTI": table.has(*MATRIX),
+        "KITTI": table.has(*MATRIX) and not table.has("time"),
+        "matrices": table.has(*MATRIX),
         "EuRoC": order is not None and (order.startswith("q_rs_") or (table.separator == "," and not order)),
         "TUM": table.separator in (None, "\t") and tuple(table.columns) == TUM,
         "GPS": table.has("latitude", "longitude"),
@@ -132,8 +143,8 @@ def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
 
 def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[np.int64], str]:
     """(T,) times in ns, and what was understood. KITTI's are in times.txt beside, or those of the frames."""
-    if table.has(*MATRIX):
-        path, count = table.path, len(table)
+    path, count = table.path, len(table)
+    if not table.has("time") and (table.has(*MATRIX) or not any(table.columns.values())):
         beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
         file = next((each for each in beside if is_there(each)), None)
         if file is None and drive.times_ns is not None and count == len(drive.times_ns):
@@ -267,7 +278,9 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     if stated["pose_axes"] is not None:
         stated["poses_of"] = stated["poses_of"] or "vehicle"
     of_gps = table.has("latitude", "longitude")
-    if of_gps or not (table.has(*QUATERNION) or table.has(*MATRIX)):  # angles are those of a vehicle in the world
+    if of_gps or not any(
+        table.has(*each) for each in (QUATERNION, MATRIX, ROTATION_VECTOR)
+    ):  # angles are those of a vehicle in the world
         cameras, stated["pose_transform"] = [], stated["pose_transform"] or "world_from_body"
     if of_gps:
         stated["pose_axes"] = stated["pose_axes"] or "flu"
@@ -281,7 +294,7 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
             rank = each.rank + int(drive.stated.pose_angles is None and _is_unusual(each.states["pose_angles"], table))
             states = {**each.states, **({} if unit == "m" else {"pose_unit": unit})}
             readings.append(replace(each, states=states, rank=rank))
-    yield from sorted(readings, key=lambda each: (each.rank, table.has(*MATRIX) and each.camera != zeroth))
+    yield from sorted(readings, key=lambda each: (each.rank, tuple(table.columns) == MATRIX and each.camera != zeroth))
 
 
 def _units(positions: Array, times_ns: NDArray[np.int64], drive: DrivePoses) -> list[str]:
@@ -342,15 +355,18 @@ def _of_angles(table: Table, drive: DrivePoses) -> dict[str, Array]:
     if table.has("heading", "yaw"):
         raise InputError(f"{table.path}: has a column of yaw and one of heading: remove one")
     angles, of_gps = table.numbers("roll", "pitch", name), table.has("latitude")
-    kinds = list(ANGLES)
+    kinds = list(ANGLES[0 if table.has(*ROTATION_VECTOR) else 1 :])
     if name == "heading" and of_gps:
         kinds.sort(key=lambda kind: (kind != "compass", kind != "compass-radians"))
     if mark := re.search(r"[_\[( ](deg|rad)", table.columns[name]):
         kinds = [kind for kind in kinds if ("rad" in kind) == (mark[1] == "rad")]
     if np.abs(angles).max() > LARGEST_RADIANS:
-        kinds = [kind for kind in kinds if "rad" not in kind]
+        kinds = [kind for kind in kinds if "rad" not in kind and kind != "vector"]
     rotations = {}
     for kind in [drive.stated.pose_angles] if drive.stated.pose_angles in ANGLES else kinds:
+        if kind == "vector":
+            rotations[kind] = np.roll(Rotation.from_rotvec(angles).as_quat(), 1, axis=1)
+            continue
         roll, pitch, yaw = (angles if "rad" in kind else np.radians(angles)).T
         if kind.startswith(("compass", "clockwise")):
             pitch, yaw = -pitch, (np.pi / 2 if kind.startswith("compass") else 0) - yaw
