@@ -14,7 +14,7 @@ from bevcli.geometry.transforms import Pose, inverse, rigid
 from bevcli.sequences.files.ego_motion_file import DrivePoses, FrameTimesNeeded, ReadPoses, read_ego_motion, read_poses
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.formats.pose_units import course
+from bevcli.workshop.formats.pose_readings import course
 
 SPEED, RADIUS = 8.0, 40.0  # m/s, metres
 START = 1_700_000_000_250_000_000

@@ -129,7 +129,7 @@ class KittiDrive(FolderOptions, Format):
 
     name = "a KITTI drive"
     expected = "image_2 and calib.txt, or image_02/data"
-    reader = "bevcli.workshop.formats.kitti_drive:open_kitti"
+    reader = "bevcli.workshop.formats.kitti:open_kitti"
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -31,7 +31,7 @@ from bevcli.workshop.formats.camera_poses import (
     rig_readings,
 )
 from bevcli.workshop.formats.information_files import read_information
-from bevcli.workshop.formats.kitti_drive import KITTI_FILES, read_kitti
+from bevcli.workshop.formats.kitti import KITTI_FILES, read_kitti
 from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.matching import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.named_calibration import SUFFIXES, read_document, read_named

@@ -30,15 +30,17 @@ from bevcli.sequences.files.ego_motion_file import NORM_TOLERANCE, DrivePoses, F
 from bevcli.sequences.files.readings import PoseReading
 from bevcli.sequences.native import TimeKind
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.formats.kitti_drive import read_oxts
+from bevcli.workshop.formats.kitti import read_oxts
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.pose_readings import (
     FASTEST_M_S,
     compared_rows,
     in_usual_axes,
+    in_usual_units,
     of_bodies,
     of_ego,
     quaternions_of_angles,
+    with_course,
 )
 from bevcli.workshop.formats.pose_table import (
     MATRIX,
@@ -51,7 +53,6 @@ from bevcli.workshop.formats.pose_table import (
     read_column,
     read_table,
 )
-from bevcli.workshop.formats.pose_units import in_usual_units, with_course
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
