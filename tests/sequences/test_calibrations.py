@@ -95,6 +95,18 @@ SPELLINGS = {
         "dist_coeffs": [D],
         "T_vehicle_camera": {"rows": 4, "cols": 4, "data": pose(name).ravel().tolist()},
     },
+    "Autoware.AI": lambda name: {
+        "CameraMat": k_of(name).ravel().tolist(),
+        "DistCoeff": D,
+        "ImageSize": [800, 450],
+        "CameraExtrinsicMat": pose(name).ravel().tolist(),
+    },
+    "flat": lambda name: {
+        **dict(zip(("fx", "fy", "cx", "cy"), four(name), strict=True)),
+        "D": D,
+        **dict(zip(("tx", "ty", "tz"), pose(name)[:3, 3].tolist(), strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(pose(name)[:3, :3]).as_quat().tolist(), strict=True)),
+    },
     "by column, P, shares": lambda name: {
         "P": np.c_[k_of(name) / [[800], [450], [1]], np.zeros(3)].tolist(),
         "width": 800,

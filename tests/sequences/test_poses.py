@@ -1,5 +1,6 @@
 """Files of poses and positions: a circle, driven at a stated speed, is the same ego-motion in every format and unit."""
 
+import json
 import re
 import tracemalloc
 from dataclasses import replace
@@ -92,6 +93,19 @@ FORMATS = {
     "3x4 by columns": (lines(*MATRICES[:, :3].swapaxes(1, 2).reshape(COUNT, 12).T), "the times of the frames"),
     "rotation vectors": (
         lines(S, X, Y, ZERO, *LEVEL, YAW, separator=",", header="t,x,y,z,rx,ry,rz"), "rotation vectors"),
+    "rows and columns": (
+        lines(S, *MATRICES[:, :3, :3].reshape(COUNT, 9).T, X, Y, ZERO, separator=",",
+              header="date,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"), "matrices, 60 rows"),
+    "angles in Greek": (
+        lines(S, X, Y, *LEVEL, YAW, separator=",", header="t,x,y,phi,theta,psi"), "yaw in radians"),
+    "theta": (lines(S, X, Y, YAW, separator=",", header="t,x,y,theta"), "yaw in radians"),
+    "indices": (lines(range(COUNT), X, Y, YAW, separator=",", header="frame,x,y,yaw"), "the times of the frames"),
+    "json": (json.dumps({"poses": [
+        {"stamp": time, "pose": {"position": [x, y, 0.0], "rotation": [0.0, 0.0, z, w]}}
+        for time, x, y, z, w in zip(TIMES.tolist(), X, Y, QZ, QW, strict=True)]}), "quaternion x y z w"),
+    "a json object a line": (
+        "\n".join(json.dumps({"timestamp_us": time // 1000, "pose": matrix.tolist()})
+                  for time, matrix in zip(TIMES.tolist(), MATRICES, strict=True)), "microseconds since 1970"),
     "gps in integers": (
         lines(S, *(np.round(np.array(each, float) * 1e7).astype(int) for each in (LATITUDE, LONGITUDE)), COMPASS,
               separator=",", header="timestamp,lat,lon,heading"), "in 1e-7 degrees"),
@@ -254,8 +268,10 @@ def test_times_with_two_readings_are_asked_for(tmp_path):
         (lines(["1.70000E+09"] * COUNT, X, Y, ZERO, *LEVEL, QZ, QW), 'line 1, column time: the last digits of "1.7'),
         (lines(S[::-1], X, Y, ZERO, *LEVEL, QZ, QW), "line 2: its time is not later"),
         (lines(S, X, Y, ZERO, *LEVEL, QZ, QW + 0.01), "quaternion's norm is .*expected 1"),
-        (lines(S, X, Y, separator=",", header="t,x,y"), "columns of the orientation are missing"),
-        (lines(X, Y, YAW, separator=",", header="x,y,yaw"), "a column of times is missing"),
+        (lines(S, *LEVEL, separator=",", header="t,x,y"), "columns of the orientation are missing"),
+        (lines(X[1:], Y[1:], YAW[1:], separator=",", header="x,y,yaw"), "a column of times is missing"),
+        ('{"poses": [{"t": 1, "x": 2', "broken JSON"),
+        ('[{"t": 1, "x": 0, "y": 0}, {"t": 2, "x": 0}]', "pose 1 has other fields than the first one"),
         (lines(S, X, Y, YAW, YAW, separator=",", header="t,x,y,yaw,heading"), "yaw and one of heading"),
         (lines(S, X, X, Y, YAW, separator=",", header="t,x,px,y,yaw"), 'columns "x" and "px" are both x'),
         (lines(S, X + 91, Y, YAW, separator=",", header="t,lat,lon,yaw"), "is no place on Earth"),
@@ -471,7 +487,6 @@ def test_places_that_fit_no_metres_beside_them_are_asked_for(tmp_path):
             table("time,lat,lon", S, LATITUDE[:1] * COUNT, LONGITUDE[:1] * COUNT),
             r"moves less than 5 m has no course: add",
         ),
-        (table("time,x,y", S, X, Y), r"orientation are missing \(.*\): add them, or measure .* `odometry=True`"),
         ('<?xml version="1.0"?><gpx></gpx>', "has no points of a track"),
         (re.sub("<time>.*?</time>", "", gpx()), "point 1 has no time: export the track with times"),
         (gpx()[:300], "broken XML"),

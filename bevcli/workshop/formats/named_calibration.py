@@ -29,14 +29,24 @@ from bevcli.workshop.formats.pose_table import number_of
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
 INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
-              "camintrinsic", "projectionparameters", "p", "projectionmatrix")  # fmt: skip
+              "camintrinsic", "projectionparameters", "p", "projectionmatrix", "cameramat")  # fmt: skip
 LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
         "distortionparameters")  # fmt: skip
 LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
 WIDTH, HEIGHT = ("width", "imagewidth", "w"), ("height", "imageheight", "h")
 SIZE = ("resolution", "imagesize", "size")
 FOCAL = ("f", "focallength")
-TRANSFORM = ("t", "extrinsics", "extrinsic", "transform", "transformmatrix", "pose", "rt", "extrinsicmatrix")
+TRANSFORM = (
+    "t",
+    "extrinsics",
+    "extrinsic",
+    "transform",
+    "transformmatrix",
+    "pose",
+    "rt",
+    "extrinsicmatrix",
+    "cameraextrinsicmat",
+)
 ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "quaternion", "quaternionwxyz",
             "quaternionxyzw", "q", "qvec", "rvec", "orientation", "rpy", "euler", "eulerangles")  # fmt: skip
 ANGLES = ("roll", "pitch", "yaw")
@@ -120,8 +130,12 @@ def cameras_of(document: Any, path: Path) -> Cameras:
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
     entries = _value(document, "cameras", "sensors", "cameracalibrations")
+    intrinsics, extrinsics = (_value(document, f"{key}s", key) for key in ("intrinsic", "extrinsic"))
+    if isinstance(intrinsics, dict) and isinstance(extrinsics, dict):  # perhaps a mapping of cameras each
+        common = [name for name, of in intrinsics.items() if isinstance(of, (dict, list)) and name in extrinsics]
+        entries = {name: {"intrinsics": intrinsics[name], "extrinsics": extrinsics[name]} for name in common} or entries
     if isinstance(entries, list):
-        names = [str(_value(entry, "name", "cameraname", "id", "channel") or f"camera{index}")
+        names = [str(_value(entry, "name", "cameraname", "id", "channel", "sensorid") or f"camera{index}")
                  if isinstance(entry, dict) else f"{index}" for index, entry in enumerate(entries)]  # fmt: skip
         for name in (name for index, name in enumerate(names) if name in names[:index]):
             raise InputError(f"{path}: camera {name} is in the list twice: keep one")
@@ -310,7 +324,8 @@ def _matrices(value: Any) -> dict[str, Array]:
 
 def _with_vectors(plain: Fields) -> Fields:
     """A mapping whose x, y, z, roll, pitch and yaw are one translation and one rotation."""
-    vectors = {"rpy": [plain.get(name) for name in ANGLES], "xyz": [plain.get(name) for name in "xyz"]}
+    parts = {"rpy": ANGLES, "xyz": "xyz", "rotationwxyz": ("qw", "qx", "qy", "qz"), "translation": ("tx", "ty", "tz")}
+    vectors = {name: [plain.get(part) for part in of] for name, of in parts.items()}
     return plain | {name: numbers for name, numbers in vectors.items() if None not in numbers}
 
 
@@ -322,8 +337,9 @@ def _numbers(value: Any) -> Array | None:
 
 def _rotations(name: str, value: Any) -> dict[str, Array]:
     """(3, 3) rotations by the order of the quaternion; "" where there is one."""
-    if isinstance(value, dict) and {"w", "x", "y", "z"} <= value.keys():
-        name, value = "rotationwxyz", [value[axis] for axis in "wxyz"]
+    for axes in ("w x y z", "qw qx qy qz"):
+        if isinstance(value, dict) and {*axes.split()} <= value.keys():
+            name, value = "rotationwxyz", [value[axis] for axis in axes.split()]
     if isinstance(value, dict) and {*ANGLES} <= value.keys():
         name, value = "rpy", [value[angle] for angle in ANGLES]
     array = _numbers(value)

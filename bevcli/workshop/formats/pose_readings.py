@@ -45,6 +45,7 @@ HIGHEST_M = 9000.0  # of an altitude in metres
 NEAR_ZERO = 0.1  # latitude and longitude: places of a simulator in degrees, none on land in radians
 AGREE = 1.2  # ratio of two distances that are the same
 COURSE_M = 2.0  # between two positions, whose direction is the course
+COURSE = "course"  # the name of columns of an orientation that is this
 LEAST_M = 5.0  # shorter ways show no course
 
 
@@ -291,17 +292,16 @@ def with_course(table: Table, positions: Array, times_ns: NDArray[np.int64]) -> 
     """
     if any(table.has(*names) for names in (QUATERNION, MATRIX, ("yaw",), ("heading",))):
         return table
-    is_gps = table.has("latitude", "longitude")
-    yaws = course(positions[:, :2], times_ns) if is_gps else None
+    yaws = course(positions[:, :2], times_ns)
     if yaws is None:
-        why = f", and a vehicle that moves less than {LEAST_M:g} m has no course" if is_gps else ""
         raise InputError(
-            f"{table.path}: columns of the orientation are missing (expected qw, qx, qy, qz; yaw; or heading){why}: "
-            "add them, or measure the motion by `odometry=True` (`--odometry`)"
+            f"{table.path}: columns of the orientation are missing (expected qw, qx, qy, qz; yaw; or heading), and a "
+            f"vehicle that moves less than {LEAST_M:g} m has no course: add them, or measure the motion by "
+            "`odometry=True` (`--odometry`)"
         )
     level = np.zeros(len(yaws))
     columns = dict(zip(QUATERNION, (np.cos(yaws / 2), level, level, np.sin(yaws / 2)), strict=True))
-    table = with_numbers(table, columns, "course")
+    table = with_numbers(table, columns, COURSE)
     return replace(table, notes=(*table.notes, "the heading is the course, as it states none"))
 
 

@@ -3,11 +3,13 @@
 GPX, KML, NMEA, GoPro's and what `ros2 topic echo --csv` prints are made such tables.
 """
 
+import json
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -17,6 +19,8 @@ from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CSV_BYTES, CsvRow, parse_numbers_at_once
 from bevcli.parsing.files import read_bytes, read_text
+from bevcli.printing import reason_of
+from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.workshop.formats.markup import parse_xml
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
@@ -49,7 +53,7 @@ _OF = "(?:.*[._])?"  # such as field.pose.pose. in front of position.x
 # By quantity, the names of its column in lower case.
 NAMES = {
     "time": rf"t|secs?|seconds|(?:gps|unix|utc|date)[_ ]?time{_UNIT}|"
-            rf"{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch){_UNIT}",
+            rf"{_OF}(?:time|times|timestamp|timestamps|stamp|utime|epoch|date|datetime){_UNIT}",
     "seconds": rf"{_OF}secs?",
     "nanoseconds": rf"{_OF}(?:nsecs?|nanosecs?)",
     **{axis: rf"[pt]?_?{axis}{_LENGTH}|p_\w+_{axis}|{_OF}(?:pos|pose|position|translation|location)[._]?{axis}{_LENGTH}"
@@ -58,14 +62,15 @@ NAMES = {
     "down": rf"(?:pos_|ned_)?down{_LENGTH}|(?:pos|ned)_d{_LENGTH}",
     **{f"q{axis}": rf"q_?{axis}|q_\w+_{axis}|{_OF}(?:quat|quaternion|orientation|rotation|rot)[._]?{axis}"
        for axis in "wxyz"},
+    **{name: name for name in MATRIX},
     **{f"r{axis}": rf"r{axis}|(?:rot|rotation|rotation_?vector|rot_?vec|r_?vec|axis_?angle)[._]?{axis}"
        for axis in "xyz"},
     "latitude": rf"{_OF}lat(?:itude)?{_UNIT}",
     "longitude": rf"{_OF}(?:lon|lng|long|longitude){_UNIT}",
     "altitude": rf"{_OF}(?:alt|altitude|elevation|ele|height){_UNIT}",
-    "roll": rf"{_OF}roll{_UNIT}",
-    "pitch": rf"{_OF}pitch{_UNIT}",
-    "yaw": rf"{_OF}yaw{_UNIT}",
+    "roll": rf"{_OF}roll{_UNIT}|phi",
+    "pitch": rf"{_OF}pitch{_UNIT}",  # theta is one beside psi, and alone a yaw
+    "yaw": rf"{_OF}yaw{_UNIT}|psi|theta",
     "fix": rf"{_OF}(?:gps_?)?fix(?:_?(?:type|quality|mode))?",
     "status": rf"{_OF}(?:status\.status|status|nav_status)",
     "heading": rf"{_OF}(?:heading|course|azimuth|bearing){_UNIT}",
@@ -168,12 +173,19 @@ def read_table(path: Path) -> Table | None:
             spans.extend((number, *match.span(1)))
     if not spans:
         return None
-    first = text[spans[1] : spans[2]].strip()
-    separator = next((sign for sign in (";", "\t", ",") if sign in first), None)
-    count = len(_cells(first, separator))
+    row = text[spans[1] : spans[2]].strip()
+    separator = next((sign for sign in (";", "\t", ",") if sign in row), None)
+    count = len(_cells(row, separator))
     names = _cells(header, separator)
     names = names if len(names) == count else re.split(r"[,;\s]+", header)
+    first = int("r33" in names)  # of the numbers of rows and columns
+    names = [re.sub("^r([0-3])([0-3])$", lambda of: f"m{int(of[1]) - first}{int(of[2]) - first}", name)
+             for name in names]  # fmt: skip
+    if "psi" in names:
+        names = ["pitch" if name == "theta" else name for name in names]
     places = _columns(path, names) if len(names) == count else {}
+    if "m00" in places and {*VECTOR} <= places.keys():
+        places |= {f"m{row}3": places[axis] for row, axis in enumerate(VECTOR)}
     if len(places) < 2:
         rows = [text[start:end] for _, start, end in np.reshape(spans, (-1, 3))[[0, len(spans) // 6, -1]].tolist()]
         unnamed = _unnamed([[number_of(cell) for cell in _cells(row, separator)] for row in rows], separator)
@@ -261,6 +273,8 @@ def table_text(path: Path) -> str:
         return "\n".join(_of_track(path))
     text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
     first = text.lstrip().partition("\n")[0].strip()
+    if first.startswith(("[", "{")):
+        return "\n".join(_of_objects(path, text))
     if NMEA.match(first) or first.startswith("$G"):
         return "\n".join(_of_nmea(path, text))
     if MESSAGE.match(first) and (header := MESSAGES.get(first.count(",") + 1)):
@@ -270,6 +284,40 @@ def table_text(path: Path) -> str:
         header = ",".join(GOPRO.get(name, f"other{index}") for index, name in enumerate(names))
         return f"{header}\n{text.lstrip().partition(chr(10))[2]}"
     return text
+
+
+def _of_objects(path: Path, text: str) -> Iterator[str]:
+    """The poses of a JSON file: a list of objects, alone or in an object, or one object a line."""
+    try:
+        entries = json.loads(text)
+    except ValueError:
+        try:
+            entries = [json.loads(line) for line in text.splitlines() if line.strip()]
+        except ValueError as error:
+            raise InputError(f"{path}: broken JSON ({reason_of(error)[:200]})") from None
+    if isinstance(entries, dict):
+        entries = next((each for each in entries.values() if isinstance(each, list)), [])
+    rows = [dict(_flat("", entry)) for entry in entries if isinstance(entry, dict)]
+    for index, row in enumerate(rows):
+        if row.keys() != rows[0].keys():
+            raise InputError(f"{path}: pose {index} has other fields than the first one: {', '.join(row)[:200]}")
+    yield from (",".join(map(str, row)) for row in ([*rows[0]], *(row.values() for row in rows))) if rows else ()
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The numbers and texts of a value in JSON by names of columns."""
+    numbers = array_of_numbers(value) if isinstance(value, list) else None
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield from _flat(f"{name}.{key}" if name else str(key), each)
+    elif numbers is not None and numbers.shape in ((3, 4), (4, 4)):
+        yield from zip(MATRIX, map(repr, numbers[:3].ravel().tolist()), strict=True)
+    elif numbers is not None and numbers.shape in ((3,), (4,)):
+        order = QUATERNION if name.endswith("wxyz") else ("qx [?]", "qy [?]", "qz [?]", "qw [?]")
+        columns = [f"{name}.{axis}" for axis in VECTOR] if len(numbers) == 3 else order
+        yield from zip(columns, map(repr, numbers.tolist()), strict=True)
+    else:
+        yield name, re.sub(r"[,\r\n]+", " ", str(value))
 
 
 def _of_track(path: Path) -> Iterator[str]:

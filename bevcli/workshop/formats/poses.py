@@ -33,6 +33,7 @@ from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.kitti import read_oxts
 from bevcli.workshop.formats.name_times import SINCE_1970_NS, UNITS_NS, WORDS
 from bevcli.workshop.formats.pose_readings import (
+    COURSE,
     FASTEST_M_S,
     compared_rows,
     in_usual_axes,
@@ -145,7 +146,9 @@ def _positions(table: Table) -> tuple[Array, GeoOrigin | None]:
 def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[np.int64], str]:
     """(T,) times in ns, and what was understood. KITTI's are in times.txt beside, or those of the frames."""
     path, count = table.path, len(table)
-    if not table.has("time") and (table.has(*MATRIX) or not any(table.columns.values())):
+    is_named = any(table.columns.values()) and not table.has(*MATRIX)
+    is_timed = table.has("time") or table.has("seconds", "nanoseconds")
+    if not is_timed and not (is_named and drive.times_ns is not None and count != len(drive.times_ns)):
         beside = (path.with_name("times.txt"), path.parent.parent / "sequences" / path.stem / "times.txt")
         file = next((each for each in beside if is_there(each)), None)
         if file is None and drive.times_ns is not None and count == len(drive.times_ns):
@@ -279,9 +282,8 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     if stated["pose_axes"] is not None:
         stated["poses_of"] = stated["poses_of"] or "vehicle"
     of_gps = table.has("latitude", "longitude")
-    if of_gps or not any(
-        table.has(*each) for each in (QUATERNION, MATRIX, ROTATION_VECTOR)
-    ):  # angles are those of a vehicle in the world
+    is_free = any(table.has(*each) for each in (QUATERNION, MATRIX, ROTATION_VECTOR))
+    if of_gps or not is_free or table.columns.get("qw") == COURSE:  # angles are those of a vehicle in the world
         cameras, stated["pose_transform"] = [], stated["pose_transform"] or "world_from_body"
     if of_gps:
         stated["pose_axes"] = stated["pose_axes"] or "flu"
@@ -344,7 +346,7 @@ def _of_quaternions(table: Table, drive: DrivePoses) -> dict[str, Array]:
     quaternions = quaternions / norms[:, None]
     order = "wxyz" if next(name for name in table.columns if name in QUATERNION) == "qw" else "xyzw"
     orders = {order: quaternions}
-    if not table.columns["qw"]:
+    if table.columns["qw"] in ("", "qw [?]"):
         first = order == "wxyz"
         orders["xyzw" if first else "wxyz"] = np.roll(quaternions, 1 if first else -1, axis=1)
     return {name: orders[name] for name in orders if drive.stated.pose_angles in (None, name)} or orders
