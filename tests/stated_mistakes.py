@@ -53,7 +53,6 @@ def measured(times_ns, positions, yaws, seed=0, deviations=DEVIATIONS, reason=""
 
 TIMES, POSITIONS, YAWS = drive()
 SHOWN = measured(TIMES, POSITIONS, YAWS)
-SWAPPED, LEFT_HANDED = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 1.0]]), np.diag([1.0, -1, 1])
 
 
 def stated(positions=POSITIONS, yaws=YAWS, times_ns=TIMES):
@@ -63,17 +62,6 @@ def stated(positions=POSITIONS, yaws=YAWS, times_ns=TIMES):
 def turned(degrees):
     """The vehicle frame turned to the left."""
     return stated(yaws=YAWS + np.radians(degrees))
-
-
-def inverted():
-    rotations = about_z(YAWS).inv()
-    return motion_of(TIMES, -rotations.apply(POSITIONS), rotations)
-
-
-def with_axes(axes):
-    """Poses whose world and vehicle have other axes."""
-    rotations = axes @ about_z(YAWS).as_matrix() @ axes.T
-    return motion_of(TIMES, POSITIONS @ axes.T, Rotation.from_matrix(rotations))
 
 
 def antenna(point):
@@ -86,28 +74,14 @@ def jumping(row=FIRST + 4 * EVERY, size=3.0):
     return stated(positions)
 
 
-CAMERA_AXES = np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])  # x right, y down, z forward
 MISTAKES = {
     "km/h": (stated(3.6 * POSITIONS), "motion-scale", "km/h were taken for m/s", "3.6"),
     "mph": (stated(2.23694 * POSITIONS), "motion-scale", "mph were taken for m/s", "2.2"),
     "millimetres": (stated(1000 * POSITIONS), "motion-scale", "in millimetres", " ± "),
     "kilometres": (stated(POSITIONS / 1000), "motion-scale", "in kilometres", "0.001"),
     "wheel": (stated(1.08 * POSITIONS), "motion-scale", "another scale", "1.08 ±"),
-    "swapped": (stated(POSITIONS @ SWAPPED.T), "motion-axes", "axes of the positions are swapped", "hold y, x, z"),
-    "negated": (stated(POSITIONS * (1, -1, 1)), "motion-axes", "axes of the positions are negated", "hold x, -y, z"),
-    "left-handed": (with_axes(LEFT_HANDED), "motion-axes", "the poses are left-handed", "x forward, y right"),
-    "both swapped": (stated(POSITIONS @ SWAPPED.T, np.pi / 2 - YAWS), "motion-axes", "the poses are left-handed", ""),
-    "camera axes": (with_axes(CAMERA_AXES), "motion-axes", "not those of the ego frame", "x right, y down, z forward"),
-    "x left": (turned(90), "motion-axes", "not those of the ego frame", "x left, y backward"),
-    "x right": (turned(-90), "motion-axes", "not those of the ego frame", "x right, y forward"),
-    "x backward": (turned(180), "motion-axes", "not those of the ego frame", "x backward, y right"),
+    "x right": (turned(-90), "motion-axes", "x of the poses is not forward", "x points 90."),
     "a little turned": (turned(-6), "motion-axes", "x of the poses is not forward", "x points 6."),
-    "degrees": (stated(yaws=np.degrees(YAWS)), "motion-angles", "degrees of the yaw were taken for radians", ""),
-    "radians": (stated(yaws=np.radians(YAWS)), "motion-angles", "radians of the yaw were taken for degrees", ""),
-    "compass": (stated(yaws=np.pi / 2 - YAWS), "motion-angles", "clockwise from y, as a compass", ""),
-    "clockwise": (stated(yaws=-YAWS), "motion-angles", "counts clockwise from x", ""),
-    "no rotations": (stated(yaws=0 * YAWS), "motion-angles", "do not turn, but the images do", ""),
-    "inverted": (inverted(), "motion-inverted", "ego_from_world", ""),
     "late": (stated(times_ns=TIMES + 180_000_000), "motion-time", "another time", "ms too late"),
     "early": (stated(times_ns=TIMES - 70_000_000), "motion-time", "another time", "ms too early"),
     "seconds late": (stated(times_ns=TIMES + 5_000_000_000), "motion-time", "another time", "s too late"),

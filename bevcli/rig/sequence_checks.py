@@ -372,7 +372,8 @@ def _mistake(drive: _Drive, ego_motion: EgoMotion) -> Finding | None:
     for (code, message, advice), undone in (
         (order, replace(ego_motion, quaternions=np.roll(quaternions, 1, axis=1))),
         (order, replace(ego_motion, quaternions=np.roll(quaternions, -1, axis=1))),
-        (("ego-inverted", "the poses are ego_from_world, the inverse", "invert them"),
+        (("ego-inverted", "the poses are ego_from_world, the inverse",
+          "invert them, or pass `--pose-transform body_from_world`"),
          replace(ego_motion, translations=inverted, quaternions=quaternions * [1, -1, -1, -1])),
     ):  # fmt: skip
         if _Drive.of(undone).is_plausible:
@@ -393,7 +394,7 @@ def _direction(drive: _Drive) -> list[Finding]:
         advice = "x of the ego frame is forward: rotate the poses by 180° about z, unless the whole drive is in reverse"
     elif 1 - ahead - back >= MOST_STEPS:
         code, message, expected = "ego-sideways", "the vehicle drives sideways", "forward"
-        advice = "the ego frame is x forward, y left: rotate the poses into it"
+        advice = "the ego frame is x forward, y left: rotate the poses into it, or state their axes by `--pose-axes`"
     else:
         return []
     return [Finding(code, "error", None, message, _motion_text(drive), expected, advice)]

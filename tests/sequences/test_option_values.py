@@ -45,7 +45,7 @@ def test_values_that_mean_something_are_taken():
 @pytest.mark.parametrize(
     ("stated", "said"),
     [
-        ({"poses_of": "CAM_FRONT"}, "states all of its poses: remove `poses_of`"),
+        ({"pose_angles": "degrees"}, "states all of its poses: remove `pose_angles`"),
         ({"pose_times": "s"}, "states all of its poses: remove `pose_times`"),
         ({"ego_motion_file": "none.csv", "ego_motion": "optional"}, "none.csv: the file is missing"),
     ],

@@ -67,10 +67,12 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses:
     Raises InputError, and FrameTimesNeeded for a file whose times only those of the frames can explain.
     """
     if _is_own(path):
-        for name in ("pose_times", "pose_angles", "poses_of"):
+        for name in ("pose_times", "pose_angles"):
             if getattr(drive.stated, name) is not None:
                 raise InputError(f"{path}: states all of its poses: remove {named(RigOptions, name)}")
         own = read_ego_motion(path)
+        if any(getattr(drive.stated, name) is not None for name in ("poses_of", "pose_axes", "pose_transform")):
+            return _of_others(path, drive) or ReadPoses(own)
         return ReadPoses(own) if own.velocities_are_stated or path.name == EGO_MOTION else _doubted(own, path, drive)
     poses = _of_others(path, drive)
     if poses is not None:

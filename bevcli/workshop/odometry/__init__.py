@@ -6,7 +6,7 @@ In the order of the work:
     measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig
     report        the measured motion in words and files, and the option `odometry` of `open_sequence`
     picture       odometry.png and odometry.rrd: the way on the road, and curves
-    stated        stated poses at the times of frames, and common mistakes in them, undone one by one
+    measured_steps  measured steps, and how far stated ones are from them
     compare       stated poses against the measured motion, and the check of `bevcli project-debug`
 """
 

@@ -1,7 +1,8 @@
 """Stated poses against the measured motion: the mistake that explains their difference; the check of `project-debug`.
 
-The common mistakes are undone in turn, and the stated steps then compared with the measured ones in standard
-deviations. The mistake whose undoing fits best is named if it fits much better than the poses as they are.
+Another scale, point, time or direction is undone in turn, and the stated steps then compared with the measured ones in
+standard deviations. What fits much better than the poses as they are is named. Where that is nothing, the judge is
+asked for another reading of the poses.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,8 +18,10 @@ from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.sequences.open import DriveView
+from bevcli.workshop.correspondence.poses import Poses, steps_between
 from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
-from bevcli.workshop.odometry.stated import FREEDOMS, MeasuredSteps, Poses, mistakes, steps_between, turn_between
+from bevcli.workshop.odometry.measured_steps import FREEDOMS, MeasuredSteps
+from bevcli.workshop.readings.stated import fitting_poses
 
 FEWEST_STEPS = 3  # that are measured
 FITS = 5.0  # largest distance of a step that fits, in deviations
@@ -122,15 +125,11 @@ def _candidates(measured: MeasuredSteps, rows: Poses, steps: Array) -> Iterator[
     yield _turned(measured, steps)
     yield from _of_another_time(measured, rows)
     yield _of_another_point(measured, steps)
-    undone = list(mistakes(rows, measured.times_ns, measured.poses))
-    both = np.stack([steps, *(mistake.steps for mistake in undone)])
-    fit, *counts = (measured.distances(both) < FITS)[:, measured.is_used].sum(1).tolist()
-    mistaken: list[tuple[tuple[Finding, ...], Array]] = []
-    for mistake, count in zip(undone, counts, strict=True):
-        description = mistake.found or f"{fit} of {measured.is_used.sum()} steps fit, {count} where it is undone"
-        finding = _error(mistake.code, mistake.message, description, mistake.expected, mistake.advice)
-        mistaken.append(((finding,), mistake.steps))
-    yield from _scaled(measured, mistaken)
+    ends = rows.times_ns[[0, -1]].sum()
+    backwards = Poses(ends - rows.times_ns[::-1], rows.rotations[::-1], rows.positions[::-1])
+    message, advice = "the poses run backwards in time", "reverse the order of their rows"
+    reversed_steps = steps_between(backwards.at(measured.times_ns)[0])
+    yield from _scaled(measured, [((_error("motion-reversed", message, "", "", advice),), reversed_steps)])
 
 
 def _scaled(measured: MeasuredSteps, undone: list[tuple[tuple[Finding, ...], Array]]) -> Iterator[_Candidate]:
@@ -195,6 +194,12 @@ def _turned(measured: MeasuredSteps, steps: Array) -> _Candidate:
     message, advice = "x of the poses is not forward", "turn their rotations about z, or check the cameras' yaw"
     finding = _error("motion-axes", message, description, "x forward", advice, abs(turn) > LARGE_TURN)
     return _candidate(measured, undone, (finding,), 1)
+
+
+def turn_between(steps: Array, measured: Array, weights: Array) -> float:
+    """The angle about z, radians, from the translations of steps (K, 4, 4) to the measured ones; weights: (K,)."""
+    flat, shown = (motion[:, 0, 3] + 1j * motion[:, 1, 3] for motion in (steps, measured))
+    return float(np.angle((weights * shown * flat.conj()).sum()))
 
 
 def _of_another_point(measured: MeasuredSteps, steps: Array) -> _Candidate:
@@ -329,6 +334,7 @@ def _roughness(times_ns: NDArray[np.int64], steps: Array) -> Array:
 
 STEPS = 8  # that are measured
 BETWEEN_NS = 400_000_000  # between two frames
+UNEXPLAINED = "motion-wrong-drive", "motion-not-compared", "motion-jumps", "motion-time", "motion-origin"
 MOST_TURN, MOVES_M, MOVING = 0.3, 0.5, 0.05  # what a step tells: its turn up to this, radians; and that it moves
 
 
@@ -351,7 +357,13 @@ def stated_motion_steps(drive: Drive, steps: int = STEPS) -> Iterator[tuple[Find
     except InputError as error:
         yield (not_compared(str(error)),)
         return
-    yield compare(stated_poses(some), MeasuredMotion.of(some, measured), [stamp.index for stamp in some.stamps])
+    stated, motion = stated_poses(some), MeasuredMotion.of(some, measured)
+    numbers = [stamp.index for stamp in some.stamps]
+    findings = compare(stated, motion, numbers)
+    if any(finding.code in UNEXPLAINED for finding in findings) and (found := fitting_poses(some, stated)):
+        reading, undone = found
+        findings = (reading, *(each for each in compare(undone, motion, numbers) if each.code not in UNEXPLAINED))
+    yield findings
 
 
 def stated_poses(drive: Drive) -> EgoMotion:

@@ -5,6 +5,7 @@ In the order of the work:
     residuals     how far matched points are from where a reading puts them
     heights       how high the cameras are above the road, by the poses and the images
     judge         the reading that the images show, or the question to the user
+    stated        what stated poses are where the images contradict them, for `bevcli project-debug`
 
 A reading is taken if its residual is what sound drives have, and those of all others are clearly larger.
 """

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import Finding, InputError
+from bevcli.frame import Drive
 from bevcli.geometry.transforms import Array, inverse, rigid
 from bevcli.options import named
 from bevcli.sequences.files.calibration_file import CONTRADICTED, RigDraft
@@ -16,11 +17,11 @@ from bevcli.sequences.files.ego_motion_file import ReadPoses
 from bevcli.sequences.files.readings import PoseReading, Reading, RigReading, differing, question
 from bevcli.sequences.images import ListedDrive
 from bevcli.sequences.options import RigOptions
+from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.formats.calibrations import poses_in_words
 from bevcli.workshop.formats.camera_poses import on_both_sides
 from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S, in_usual_axes
 from bevcli.workshop.formats.poses import of_reading
-from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.readings.heights import height_above_road
 from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
 from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
@@ -103,7 +104,7 @@ def decide(draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOp
 
     Raises InputError where the images do not decide: it names the options that do.
     """
-    judged = _Judged(draft, poses, drive, options)
+    judged = Judged(draft, poses, drive, options)
     chosen, evidence = judged.chosen()
     if chosen.rig is not None:
         reading, raised = chosen.rig, ""
@@ -135,10 +136,10 @@ def _with_rig(draft: RigDraft, reading: RigReading, evidence: str, raised: str) 
     return replace(draft, rig=rig, findings=(replace(first, message=text), *others), readings=())
 
 
-class _Judged:
+class Judged:
     """The candidates of a drive, compared with its images."""
 
-    def __init__(self, draft: RigDraft, poses: ReadPoses, drive: ListedDrive, options: RigOptions) -> None:
+    def __init__(self, draft: RigDraft, poses: ReadPoses, drive: Drive, options: RigOptions) -> None:
         self._draft, self._poses, self._drive, self._options = draft, poses, drive, options
         self._times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
         self._pairs = list(camera_pairs(drive, self._frames())) if options.image_check else []
@@ -240,18 +241,31 @@ class _Judged:
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
 
-    def contradiction(self, chosen: Candidate) -> str:
-        """The reading that fits the images where what is stated does not, as options; "" for none."""
+    def fitting(self, chosen: Candidate | None) -> tuple[Candidate, str] | None:
+        """The reading that fits the images where what is stated does not, and the residual of that, in words.
+
+        chosen: what is stated; None where no vehicle moves so.
+        """
         if not (self._draft.others or self._poses.others) or len(self._pairs) < FEWEST_PAIRS:
-            return ""
+            return None
         draft = replace(self._draft, readings=self._draft.others or self._draft.readings)
         poses = replace(self._poses, readings=self._poses.others or self._poses.readings)
-        fitting = next(iter(self.candidates(draft, poses)), chosen)
-        if not fitting.is_sound or chosen.residual_px < CONTRADICTING * fitting.residual_px + CLEAR_PX:
+        fitting = next(iter(self.candidates(draft, poses)), None)
+        if fitting is None or not fitting.is_sound:
+            return None
+        if chosen is None:
+            return fitting, "the vehicle moves aside or too fast"
+        is_clear = chosen.residual_px >= CONTRADICTING * fitting.residual_px + CLEAR_PX
+        return (fitting, f"{chosen.residual_px:.1f} px") if is_clear else None
+
+    def contradiction(self, chosen: Candidate) -> str:
+        """What fits the images where what is stated does not, as options; "" for none."""
+        if (found := self.fitting(chosen)) is None:
             return ""
+        fitting, residual_px = found
         flags = fitting.whole.flags(differing([chosen.whole, fitting.whole]))
         return (
-            f"what is stated does not fit the images (residual {chosen.residual_px:.1f} px): they fit `{flags}` "
+            f"what is stated does not fit the images (residual {residual_px}): they fit `{flags}` "
             f"({fitting.residual_px:.1f} px)"
         )
 

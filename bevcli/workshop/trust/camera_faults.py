@@ -18,8 +18,8 @@ from bevcli.errors import Finding
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.points import matched
+from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
-from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.step_views import FrameView
 
 LEAST_M = 0.3  # a shorter step tells nothing

@@ -22,8 +22,8 @@ from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.open import select
+from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
-from bevcli.workshop.odometry.stated import Poses
 from bevcli.workshop.odometry.step_views import Viewer
 from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
