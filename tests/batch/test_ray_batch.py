@@ -180,13 +180,10 @@ def s3(tmp_path, monkeypatch):
     """An S3 server on this machine with the bucket "fleet"; the environment names it."""
     port = free_port()
     url = f"http://127.0.0.1:{port}"
-    for name, value in {
-        "AWS_ENDPOINT_URL": url,
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", url)
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
     server = subprocess.Popen(
         [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -209,23 +206,10 @@ def test_drives_and_results_in_s3(s3, tmp_path):
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 3, frames=2, truth=True)
     s3.put(str(tmp_path / "drives") + "/", "fleet/drives/", recursive=True)
-    arguments = (
-        "batch",
-        "s3://fleet/drives/*",
-        "--out",
-        "s3://fleet/out",
-        *OPTIONS,
-        "--workers",
-        "2",
-        "--threads",
-        "1",
-        "--eval",
-    )
+    arguments = ("batch", "s3://fleet/drives/*", "--out", "s3://fleet/out", *BATCH[4:], "--eval", "--workers", "2")
     done = command(tmp_path, *arguments)
     assert done.returncode == 0, done.stderr
-    local = command(
-        tmp_path, "batch", "drives/*", "--out", "out", *OPTIONS, "--workers", "1", "--threads", "1", "--eval"
-    )
+    local = command(tmp_path, *BATCH, "--eval", "--workers", "1")
     assert local.returncode == 0, local.stderr
     s3.invalidate_cache()
     remote = {path.rpartition("/")[2].rpartition("-")[0]: path for path in s3.ls("fleet/out/drives", detail=False)}

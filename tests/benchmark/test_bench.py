@@ -75,17 +75,9 @@ def test_a_table_has_all_rows_but_those_that_fail(tmp_path):
     with pytest.raises(SystemExit, match="1 of 6 measurements failed"):
         script["write_table"](document, "cpu")
     text = document.read_text()
-    assert [line.split(" | ")[:2] for line in text.splitlines() if "| bf16 " in line] == [
-        ["| one", "bf16"],
-        ["| three", "bf16"],
-    ]
-    assert text.startswith("before\n")
-    assert text.endswith("after\n")
-    assert "old" not in text
+    assert [line.split(" | ")[0] for line in text.splitlines() if "| bf16 " in line] == ["| one", "| three"]
+    assert (text.startswith("before\n"), text.endswith("after\n"), "old" in text) == (True, True, False)
     assert rows == [0, 0, 0, 1, 1, 1]  # written after each measurement
-    script["has_onednn"] = lambda _: False
-    script["write_table"](document, "cpu")
-    assert "bf16" not in document.read_text()
 
 
 def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
@@ -164,37 +156,8 @@ def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):
     assert data["share_within_0.1_m"] > 0.5
 
 
-HITS = (400,) * 6
-RESNET50_OPERATIONS = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights
-
-
-@cache
-def operations_of_tiny() -> float:
-    return count_operations(load_config("tiny"), HITS)
-
-
 @pytest.mark.slow
 def test_tiny_needs_slightly_more_operations_than_six_resnet50():
-    backbone = 6 * RESNET50_OPERATIONS * (480 * 800) / 224**2
-    assert 1.02 * backbone < operations_of_tiny() < 1.12 * backbone
-
-
-@pytest.mark.slow
-def test_one_more_hit_adds_its_samples_in_every_layer():
-    config = load_config("tiny")
-    more = count_operations(config, (401, *HITS[1:])) - operations_of_tiny()
-    # 3 layers, 8 heads, 8 points, 32 channels; a product and a sum for four neighbours and for the weight.
-    assert more == 3 * 8 * 8 * 32 * (4 * 2 + 2)
-
-
-@pytest.mark.slow
-def test_the_segmentation_head_is_counted():
-    """Its products with every BEV cell: five projections, and two layers of attention and of masks."""
-    config = load_config("demo")
-    cells, channels, head = config.bev_grid.rows * config.bev_grid.columns, config.channels, config.segmentation
-    queries = head.thing_queries + 3
-    projections = (2 * head.mask_layers + head.location_layers) * 2 * cells * channels**2
-    masks = head.mask_layers * 3 * 2 * queries * cells * channels
-    without = count_operations(replace(config, heads=("detection",)), HITS)
-    added = count_operations(config, HITS) - without
-    assert projections + masks < added < 1.1 * (projections + masks)
+    resnet50 = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights
+    backbone = 6 * resnet50 * (480 * 800) / 224**2
+    assert 1.02 * backbone < count_operations(load_config("tiny"), (400,) * 6) < 1.12 * backbone

@@ -125,18 +125,6 @@ def test_a_signal_ends_a_run_after_its_frame_resume_completes_it(place):
     assert_equals_whole(out, place)
 
 
-@pytest.mark.slow
-def test_a_killed_run_goes_on_with_its_finished_frames(place):
-    out = place / "killed"
-    run = Run(place, out)
-    wait_for_frames(run, out, 3)
-    run.signal(signal.SIGKILL)
-    assert run.end(20) != 0
-    assert 3 <= assert_finished_frames_are_whole(out, place) < FRAMES
-    complete(place, out, "--resume")
-    assert_equals_whole(out, place)
-
-
 def test_a_second_signal_ends_the_run_at_once(place):
     out = place / "twice"
     run = Run(place, out)

@@ -109,11 +109,13 @@ def test_other_images_stay_as_they_are(other):
         assert defogged(image) is image
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 40), (16, 16), (300, 5)])
 @pytest.mark.parametrize("grey", [0, 90, 255])
-def test_small_and_plain_images_stay_as_they_are(size, grey):
-    image = np.full((*size, 3), grey, dtype=np.uint8)
-    assert np.array_equal(defogged(image), image)
+def test_small_and_plain_images_stay_as_they_are(grey):
+    for size in ((1, 1), (2, 40), (16, 16), (300, 5), (90, 160)):
+        image = np.full((*size, 3), grey, dtype=np.uint8)
+        assert np.array_equal(defogged(image), image)
+    image[0, 0] = 255 - grey  # a single pixel of another brightness
+    assert np.array_equal(auto_levels(image), image)
 
 
 def ramp() -> np.ndarray:
@@ -134,13 +136,6 @@ def test_dark_and_pale_images_get_the_levels_of_ordinary_ones():
 
 def test_an_ordinary_image_stays_as_it_is():
     assert np.array_equal(auto_levels(ramp()), ramp())
-
-
-def test_an_image_without_contrast_stays_as_it_is():
-    for level in (0, 128, 255):
-        image = np.full((90, 160, 3), level, dtype=np.uint8)
-        image[0, 0] = 255 - level  # a single bright pixel
-        assert np.array_equal(auto_levels(image), image)
 
 
 def test_hues_stay():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from memory_drive import MemoryDrive, WithoutImages
-from simulated_device import OnDevice, SimulatedDevice, pinned, simulated
+from simulated_device import OnDevice, pinned, simulated
 
 from bevcli.config import known_models, load_config
 from bevcli.errors import InputError
@@ -128,15 +128,6 @@ def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, 
 
 
 @pytest.mark.slow
-def test_with_the_same_projections_only_results_are_waited_for(monkeypatch):
-    config = small_version("demo")
-    model, prepared = made_up_model(config), frames(config, same_projection=True)
-    with simulated("cuda:0", monkeypatch, sample_plainly) as device:
-        run(prepare_for_inference(model, device.device, "bf16"), device.device, prepared, device.waits)
-    assert device.waits == ["event"]
-
-
-@pytest.mark.slow
 def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
     config = small_version("demo")
     model, prepared = made_up_model(config), frames(config, same_projection=True)
@@ -167,29 +158,6 @@ def test_the_attention_of_a_step_is_observed_on_its_device(monkeypatch):
     assert ours.cameras.keys() == theirs.cameras.keys()
     for camera, samples in ours.cameras.items():
         np.testing.assert_allclose(theirs.cameras[camera].pixels, samples.pixels, atol=0.1)
-
-
-def test_a_step_with_a_tensor_on_another_device_is_stopped():
-    device = SimulatedDevice("cuda:1")
-    with device:
-        there = torch.zeros(3, device=device.device)
-        with pytest.raises(RuntimeError, match="on cuda:1 and on the CPU"):
-            there + torch.ones(3)
-        with pytest.raises(RuntimeError, match="the model is on cuda:1"):
-            torch.ones(3, device="cuda")
-        assert device.waits == []
-        there[[0, 2]], there.sum().item(), there.cpu(), there[there > 0]
-        assert device.waits == ["index of the CPU", "item", "cpu", "index of a mask"]
-        device.waits.clear()
-        count = there.sum().int()
-        there[count], there[:count], there[0, ...], 1.0 in there, f"{count}", there.to(CPU), range(count)
-        assert device.waits == [
-            "index of one element", "index of one element", "__contains__", "__format__", "copy to the CPU", "__index__"
-        ]  # fmt: skip
-        there.to(CPU, non_blocking=True), torch.cat([there, there])  # to pinned memory
-        assert len(device.waits) == 6
-    with SimulatedDevice("mps"), pytest.raises(TypeError, match="no float64"):
-        torch.zeros(3, device="mps").double()
 
 
 @pytest.mark.gpu

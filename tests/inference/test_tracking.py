@@ -51,10 +51,6 @@ def crossing_cars():
     return [frame(box(8 * t - 12, 0, (8, 0)), box(2, 8 * t - 14, (0, 8))) for t in np.arange(0, 3.5, 0.5)]
 
 
-def test_a_moving_object_keeps_its_identity():
-    assert identities(moving(6)) == [["0"]] * 6
-
-
 def out_of_view(boxes, *unseen):
     return replace(boxes, unseen=np.array(unseen))
 
@@ -107,14 +103,6 @@ def test_a_new_scene_starts_new_tracks():
     assert identities(moving(4), scenes="aabb") == [["0"], ["0"], ["1"], ["1"]]
 
 
-def test_a_new_scene_knows_nothing_of_the_last_one():
-    whole, _ = track(crossing_cars(), scenes="aaabbbb")
-    fresh, _ = track(crossing_cars()[3:], scenes="bbbb", start=3)
-    for one, other in zip(whole[3:], fresh, strict=True):
-        assert [int(name) - 2 for name in one.instances] == [int(name) for name in other.instances]
-        assert one.track_scores == pytest.approx(other.track_scores)
-
-
 def test_time_that_stands_still_or_jumps_starts_new_tracks():
     config = TrackerConfig(coast_s=1.0)
     state, _ = step(config, None, box(0, 0), FrameStamp(0, "a", 0))
@@ -148,20 +136,10 @@ def test_a_step_changes_neither_its_state_nor_the_boxes():
             assert np.array_equal(getattr(found, column.name), getattr(crossing_cars()[1], column.name))
 
 
-def test_a_box_outside_the_gate_is_another_object():
-    config = TrackerConfig(gates_m={"car": 2.0})
-    assert identities([box(0, 0), box(1.9, 0)], config=config) == [["0"], ["0"]]
-    assert identities([box(0, 0), box(2.1, 0)], config=config) == [["0"], ["1"]]
-
-
 def test_gates_belong_to_classes():
     config = TrackerConfig(gates_m={"car": 0.5, "bus": 3.0, "other": 1.0})
     frames = [frame(*(box(10 * k, y, name=name) for k, name in enumerate(("car", "bus", "tram")))) for y in (0, 2)]
     assert identities(frames, config=config) == [["0", "1", "2"], ["3", "1", "4"]]
-
-
-def test_a_box_of_another_class_is_another_object():
-    assert identities([box(0, 0), box(0, 0, name="truck")]) == [["0"], ["1"]]
 
 
 def test_the_better_box_chooses_first():

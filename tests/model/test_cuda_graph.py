@@ -9,7 +9,7 @@ from simulated_device import SimulatedDevice, pinned, simulated
 from torch import Tensor, nn
 
 from bevcli.model.kernels.gpu import KEPT_GRAPHS, Captured
-from bevcli.model.upload import packed, unpacked, upload_together
+from bevcli.model.upload import upload_together
 
 NAME = "cuda:0"
 
@@ -84,17 +84,6 @@ def test_arguments_on_the_cpu_are_uploaded_in_one_copy(device, monkeypatch):
         torch.testing.assert_close(found.held, model.scaled(inputs)[0].held, rtol=0, atol=0)
     assert copies == [16] * 6  # one more in the capture
     assert device.waits == []
-
-
-def test_packed_tensors_keep_their_numbers_shapes_and_types():
-    tensors = [
-        torch.tensor([[True], [False], [True]]), torch.tensor(3.5), torch.zeros(0, 4), torch.arange(3),
-        torch.arange(12.0).view(3, 4).t(), torch.tensor([1.5, 2.5, 3.5]).half(), torch.tensor([7], dtype=torch.uint8),
-    ]  # fmt: skip
-    memory = packed(tensors)
-    assert memory.dtype == torch.uint8
-    for found, expected in zip(unpacked(memory, tensors), tensors, strict=True):
-        torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
 def test_other_shapes_and_numbers_are_captured_for_themselves(device):

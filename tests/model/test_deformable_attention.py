@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from bevcli.model.deformable_attention import DeformableAttention, FeatureMaps, GridSampling, sampling_locations
-from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.deformable_attention import DeformableAttention, GridSampling, sampling_locations
+from bevcli.model.encoder import TemporalSelfAttention
 from bevcli.model.kernels.compiled import CompiledSampling, Hits, sample_hits
 from bevcli.model.kernels.loops import softmax_of_groups
-from bevcli.model.pillar_projection import PillarHits
 from bevcli.workshop.benchmark.versions import PaddedSampling
 from bevcli.workshop.training.kernels import LearnedSampling
 
@@ -218,21 +217,3 @@ def test_shifted_reference_points_sample_neighbouring_history() -> None:
     grid, old = attended.view(ROWS, COLUMNS, CHANNELS), history.view(ROWS, COLUMNS, CHANNELS)
     torch.testing.assert_close(grid[:, :-1], old[:, 1:] / 2, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(grid[:, -1], torch.zeros(ROWS, CHANNELS), atol=1e-5, rtol=0)
-
-
-def test_spatial_cross_attention_averages_cameras_seeing_a_cell() -> None:
-    block = SpatialCrossAttention(CHANNELS, heads=2, points=4, levels=1, dropout=0.1).eval()
-    pass_through(block.attention)
-    bias = torch.randn(CHANNELS)
-    with torch.no_grad():
-        block.attention.output_projection.bias.copy_(bias)
-    tokens = torch.randn(2, 1, CHANNELS).expand(2, 12, -1)  # the same value in all of a camera's tokens
-    hits = PillarHits(
-        cell=torch.tensor([0, 1, 1]),
-        reference_points=torch.full((3, 2, 2), 0.5),
-        hits_per_camera=(2, 1),
-        cameras_per_cell=torch.tensor([1, 2, 0]),
-    )
-    attended = block(torch.randn(1, 3, CHANNELS), FeatureMaps(tokens, ((3, 4),)), hits)[0]
-    expected = torch.stack([tokens[0, 0], tokens[:, 0].mean(0), torch.zeros(CHANNELS)]) + bias
-    torch.testing.assert_close(attended, expected, atol=1e-5, rtol=1e-5)

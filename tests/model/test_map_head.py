@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from small_model import small_inputs, small_model
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.segmentation import (
@@ -139,25 +138,6 @@ def test_a_wrong_configuration_is_an_error(wrong: dict) -> None:
         MapHeadConfig(**wrong)
 
 
-BOTH = ("detection", "segmentation")
-SEGMENTATION = SegmentationConfig(5, location_layers=2, mask_layers=3, attention_heads=4, feed_forward_width=48)
-
-
-def test_one_forward_pass_computes_both_heads() -> None:
-    outputs = small_model(heads=BOTH, segmentation=SEGMENTATION)(small_inputs(batch=2))
-    assert outputs.class_logits.shape == (2, 2, 12, 3)
-    assert outputs.segmentation is not None
-    assert outputs.segmentation.mask_logits.shape == (3, 2, 3 + 5, 48)
-    assert outputs.segmentation.class_logits.shape == (3, 2, 3 + 5)
-    assert outputs.segmentation.locations.shape == (2, 2, 5, 4)
-
-
-def test_without_the_head_there_are_no_outputs_and_weights() -> None:
-    model = small_model()
-    assert model(small_inputs()).segmentation is None
-    assert not [key for key in model.state_dict() if "segmentation" in key]
-
-
 def test_a_mask_is_the_weighted_sum_of_attention_maps() -> None:
     layer = MaskDecoderLayer(channels=8, heads=2, feed_forward_width=8, dropout=0.0)
     with torch.no_grad():
@@ -213,10 +193,3 @@ def test_a_bev_map_has_a_bit_a_class_and_its_first_row_ahead() -> None:
     bev_map = decode_map(outputs, SegmentationConfig(map_scale=1), grid)
     assert bev_map.cells.tolist() == [[0, 8, 0], [1, 1 + 4 + 8, 1]]
     assert (bev_map.x_range_m, bev_map.y_range_m) == ((-3, 3), (-2, 2))
-
-
-def test_a_cell_may_have_several_classes() -> None:
-    masks = torch.tensor([[9.0, 9.0], [9.0, -9.0], [-9.0, -9.0], [9.0, -9.0], [-9.0, 9.0]])[None, None]
-    outputs = SegmentationOutputs(masks, torch.full((1, 1, 5), 9.0), torch.zeros(1, 1, 2, 4))
-    one = decode_map(outputs, SegmentationConfig(map_scale=1), BevGrid(1, 2))
-    assert one.cells.tolist() == [[1 + 2 + 8, 1 + 8]]

@@ -10,7 +10,6 @@ from torch import nn
 
 from bevcli.model.backbone import Stage
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
-from bevcli.model.encoder import FeedForward
 from bevcli.model.kernels import onednn as onednn_layers
 from bevcli.model.kernels.choose import change_classes, fold_batch_norms
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledPool, load_compiled
@@ -42,16 +41,6 @@ def test_a_packed_linear_layer_equals_a_linear_layer(rows, bias):
         with torch.inference_mode():
             found = PackedLinear(linear)(x)
             torch.testing.assert_close(found, linear(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
-
-
-@pytest.mark.parametrize("activation", ["relu", "gelu"])
-def test_a_packed_feed_forward_network_equals_the_plain_one(activation):
-    for dtype in dtypes():
-        plain = FeedForward(32, 64, 0.1, activation).to(dtype).eval().requires_grad_(False)
-        packed, x = nn.Sequential(copy.deepcopy(plain)), torch.randn(2, 300, 32, dtype=dtype)
-        use_onednn(packed)
-        with torch.inference_mode():
-            torch.testing.assert_close(packed(x), plain(x), atol=TOLERANCE[dtype], rtol=TOLERANCE[dtype])
 
 
 @pytest.mark.parametrize("style", ["pytorch", "caffe"])
