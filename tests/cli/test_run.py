@@ -69,15 +69,6 @@ def test_the_command_runs_the_sample_and_says_untrained(tmp_path):
 
 
 @pytest.mark.slow
-def test_some_frames_give_the_same_boxes_as_the_whole(job):
-    whole = read_boxes(job(MemoryDrive(4), out="whole") / "predictions.json")
-    part = read_boxes(job(MemoryDrive(2), out="part") / "predictions.json")
-    for one, other in zip(part.frames, whole.frames, strict=False):
-        assert one.boxes.centers == pytest.approx(other.boxes.centers, abs=1e-4)
-        assert one.boxes.scores == pytest.approx(other.boxes.scores, abs=1e-5)
-
-
-@pytest.mark.slow
 def test_one_thread_and_two_agree(job):
     threads = torch.get_num_threads()
     try:

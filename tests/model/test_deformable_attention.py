@@ -197,16 +197,6 @@ def centers() -> torch.Tensor:
     return torch.stack([x.repeat(ROWS), y.repeat_interleave(COLUMNS)], -1)
 
 
-def test_temporal_self_attention_averages_a_cell_and_its_history() -> None:
-    block = TemporalSelfAttention(CHANNELS, 2, 4, (ROWS, COLUMNS), dropout=0.1).eval()
-    pass_through(block.attention)
-    history, current = torch.randn(1, CELL_COUNT, CHANNELS), torch.randn(1, CELL_COUNT, CHANNELS)
-    attended = block(
-        current, torch.zeros(CELL_COUNT, CHANNELS), torch.stack([history, current], 1), centers().expand(1, 2, -1, -1)
-    )
-    torch.testing.assert_close(attended, (history + current) / 2, atol=1e-5, rtol=1e-5)
-
-
 def test_shifted_reference_points_sample_neighbouring_history() -> None:
     block = TemporalSelfAttention(CHANNELS, 2, 4, (ROWS, COLUMNS), dropout=0.1).eval()
     pass_through(block.attention)

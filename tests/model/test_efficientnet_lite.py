@@ -1,6 +1,5 @@
 """Backbones and neck: sizes, strides, the original's numbers, the fast form, frozen stages."""
 
-import copy
 import importlib.util
 import re
 import sys
@@ -17,8 +16,7 @@ from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError
 from bevcli.model.bevformer.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLite, EfficientNetLiteConfig
-from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.kernels.onednn import PackedConvolution, has_onednn, use_onednn
+from bevcli.model.kernels.onednn import PackedConvolution, has_onednn
 from bevcli.model.network import Network
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.resnet import ResNetConfig
@@ -69,17 +67,6 @@ def test_equals_the_original(variant: int, size: int) -> None:
             torch.testing.assert_close(
                 found, expected[place], rtol=1e-5, atol=1e-5 * expected[place].abs().max().item()
             )
-
-
-@pytest.mark.parametrize("size", [(64, 96), (36, 50)])
-def test_the_fast_form_gives_the_same_maps(size: tuple[int, int]) -> None:
-    backbone, images = made_backbone(output_stages=ALL_STAGES).requires_grad_(False), torch.randn(2, 3, *size)
-    fast = copy.deepcopy(backbone)
-    fold_batch_norms(fast, torch.device("cpu"))
-    use_onednn(fast.to(memory_format=torch.channels_last))
-    assert not [module for module in fast.modules() if type(module) is nn.Conv2d]
-    for found, expected in zip(fast(images), backbone(images), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("precision", ["fp32", pytest.param("bf16", marks=pytest.mark.slow)])

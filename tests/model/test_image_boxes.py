@@ -376,18 +376,6 @@ def test_a_box_of_a_second_class_does_not_count(lift: Lift) -> None:
     assert logits[0, 1].max() == NO_BOX
 
 
-def test_frames_of_a_batch_do_not_change_each_other(lift: Lift) -> None:
-    first = found([upright(camera(0.5), d, 0.4, 1.75, 0.6) for d in (9, 20)], "person")
-    second = found([upright(camera(0.5), d, 0.7, 1.6, 1.8) for d in (7, 12)], "car", 0.3)
-    both = ImageBoxes(*(torch.cat([getattr(x, name) for x in (first, second)]) for name in vars(first)))
-    matrices = torch.tensor(camera(0.5)).float()[None, None].repeat(2, 1, 1, 1)
-    with torch.inference_mode():
-        together = lift(both, matrices, torch.tensor([[SIZE]] * 2))
-    for index, boxes in enumerate((first, second)):
-        for a, b in zip(together[:2], lifted_of(lift, boxes, camera(0.5))[:2], strict=True):
-            torch.testing.assert_close(a[index], b[0])
-
-
 def test_a_nearer_box_hides_a_foot() -> None:
     boxes = torch.tensor([[[[10.0, 10, 30, 50], [20.0, 20, 60, 80]]]])
     hidden = hidden_feet(boxes, torch.ones(1, 1, 2))[0, 0]

@@ -77,14 +77,6 @@ def test_folding_batch_norms_changes_no_feature_map(model, device):
         torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_a_batch_of_two_is_two_batches_of_one(model):
-    prepared = prepare_for_inference(model, CPU)
-    with torch.inference_mode():
-        both = prepared(small_inputs(3, batch=2))
-        expected = model(small_inputs(3, batch=2))
-    torch.testing.assert_close(both.box_codes, expected.box_codes, atol=1e-3, rtol=1e-3)
-
-
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_half_precision_stays_near(model, precision):
     expected, found = two_steps(model), two_steps(prepare_for_inference(model, CPU, precision))

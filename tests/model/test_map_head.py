@@ -7,19 +7,8 @@ import pytest
 import torch
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.segmentation import (
-    MaskDecoderLayer,
-    SegmentationConfig,
-    SegmentationOutputs,
-    decode_map,
-    map_layers,
-)
-from bevcli.workshop.uniad.map_head import (
-    MapHead,
-    MapHeadConfig,
-    MapOutputs,
-    merge_map,
-)
+from bevcli.model.segmentation import MaskDecoderLayer, SegmentationConfig, SegmentationOutputs, decode_map, map_layers
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map
 
 SMALL = MapHeadConfig(
     thing_queries=7,

@@ -1,6 +1,5 @@
 """NanoDet-g: the network, the weights of the package, frozen in a training, the fast forms, and boxes in the images."""
 
-import copy
 import random
 
 import nanodet as program
@@ -14,8 +13,6 @@ from torch import Tensor
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError, InputError
 from bevcli.model.fpn import FPNConfig
-from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.workshop.training.trainer import FrozenStages
@@ -138,16 +135,6 @@ def test_it_is_frozen_in_every_training_unless_stated(backbone) -> None:
         found = backbone(images)
     for ours, expected in zip(found, backbone(images), strict=True):
         torch.testing.assert_close(ours, expected, rtol=1e-3, atol=1e-4)
-
-
-def test_the_fast_form_gives_the_same_maps(backbone) -> None:
-    fast, images = copy.deepcopy(backbone), torch.randn(2, 3, 64, 96)
-    fold_batch_norms(fast, torch.device("cpu"))
-    use_onednn(fast.to(memory_format=torch.channels_last))
-    assert not [module for module in fast.modules() if isinstance(module, torch.nn.Conv2d)]
-    with torch.no_grad():
-        for found, expected in zip(fast(images), backbone(images), strict=True):
-            torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-4), ("bf16", 3e-2)])
