@@ -36,7 +36,7 @@ def fleet(tmp_path_factory):
     """Three drives with ground truth, an empty folder, and a model."""
     folder = tmp_path_factory.mktemp("fleet")
     (folder / "mini.toml").write_text(MINI_TOML)
-    write_fleet(folder / "drives", 3, truth=True)
+    write_fleet(folder / "drives", 3, frames=2, truth=True)
     (folder / "drives/empty").mkdir()
     return folder
 
@@ -95,10 +95,10 @@ def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, m
     assert facts["files"] == [str(results["d001"] / name) for name in names]
     rows = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()
     assert [row["drive"] for row in rows] == ["d000", "d001", "d002", "empty"]
-    assert [row["frames"] for row in rows] == [3, 3, 3, None]
+    assert [row["frames"] for row in rows] == [2, 2, 2, None]
     assert rows[3]["attempts"] == 2
     assert rows[3]["error"].startswith(f"{fleet}/drives/empty: is not a sequence folder")
-    assert rows[0]["boxes"] == 30 == sum(count for name, count in rows[0].items() if name.startswith("boxes_"))
+    assert rows[0]["boxes"] == 20 == sum(count for name, count in rows[0].items() if name.startswith("boxes_"))
     with (tmp_path / "out/batch.csv").open() as file:
         assert [row["drive"] for row in csv.DictReader(file)] == ["d000", "d001", "d002", "empty"]
     assert not list((tmp_path / "out/.bevcli/attempts").iterdir())
@@ -170,7 +170,7 @@ def test_a_wrong_mesh_of_a_class_ends_a_batch_before_it_starts(fleet, tmp_path):
 
 @pytest.mark.slow
 def test_a_stopped_batch_goes_on_with_the_drives_that_are_left(batch, fleet, tmp_path):
-    stopped = batch(frames=1 + 4 + 2)  # the second drive is stopped after its second frame
+    stopped = batch(frames=1 + 3 + 1)  # the second drive is stopped after its first frame
     assert stopped.stopped
     done = len(results_of(tmp_path / "out"))
     assert done == 1
@@ -220,9 +220,9 @@ def test_metrics_of_drives_equal_eval_and_joint_ones_are_written(batch, fleet, t
     assert records["d000"]["scores"] is None
     alone = evaluate(results_of(tmp_path / "out")["d001"], fleet / "drives/d001").to_dict()
     assert records["d001"]["scores"]["trans_err"] == pytest.approx(alone["tp_errors"]["trans_err"], abs=1e-6)
-    assert records["d001"]["scores"]["ground_truth_boxes"] == alone["ground_truth_boxes"] == 6
+    assert records["d001"]["scores"]["ground_truth_boxes"] == alone["ground_truth_boxes"] == 4
     joint = json.loads((tmp_path / "out/metrics.json").read_text())
-    assert (joint["drives"], joint["frames"], joint["ground_truth_boxes"]) == (2, 6, 12)
+    assert (joint["drives"], joint["frames"], joint["ground_truth_boxes"]) == (2, 4, 8)
     row = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()[1]
     assert row["mean_ap"] == records["d001"]["scores"]["mean_ap"]
 

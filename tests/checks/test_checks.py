@@ -92,8 +92,6 @@ def test_speed_measures_each_model_until_the_time_is_over(tmp_path, monkeypatch)
     (tmp_path / "mini.toml").write_text(MINI_TOML)
     for name in ("WIDTH", "HEIGHT", "FOCAL_LENGTH", "BACK_FOCAL_LENGTH"):
         monkeypatch.setattr(versions, name, getattr(versions, name) // 4)
-    # Other tests keep the images of the usual size.
-    monkeypatch.setattr(versions, "_jpeg", getattr(versions._jpeg, "__wrapped__", versions._jpeg))
     monkeypatch.setattr(measure, "CPU_EDGE", 256)
     monkeypatch.setattr(measure, "COPIED_FLOATS", 1 << 20)
     monkeypatch.setattr(measure, "MODELS", (str(tmp_path / "mini.toml"),))

@@ -10,8 +10,7 @@ import torch
 from memory_drive import make_camera, make_rig
 from small_model import HEIGHT, WIDTH, small_config, small_inputs, small_model
 
-from bevcli.checkpoints import compare, load_weights
-from bevcli.errors import WeightsError
+from bevcli.checkpoints import compare
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.ego_motion import Kinematics
@@ -139,8 +138,6 @@ def test_weights_without_the_embedding_start_a_training_only(tmp_path: Path):
     model = BEVFormer(small_config(image_tokens=WITH_RAYS))
     missing = compare(small_model().state_dict(), model.state_dict())["missing"]
     assert len(missing) == 6
-    with pytest.raises(WeightsError, match="6 missing"):
-        load_weights(path, model)
     warm_start(path, model, "small", make_rig)
     assert not model.calibration_embedding.layers[-1].weight.any()
 
