@@ -23,7 +23,7 @@ from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.road_slopes import GreyView
 from bevcli.model.step import CameraAssignment, PreparedFrame, assign_cameras
 
-GREY_WIDTH = 512  # pixels of the images in which points are followed
+GREY_WIDTH = 352  # pixels of the images in which points are followed
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
 
 

@@ -1,8 +1,8 @@
 """Hybrid object queries: boxes in the images, put on the ground, become queries of their own beside the learned ones.
 
 BEVFormerV2 (Yang et al. 2023) calls so the queries of its second stage that come from the first. Here the first stage
-is a detector of photographs and `Lift`, which knows from the box where its object stands. The queries start as these
-boxes; what the layers read of the BEV map (the ground, other cameras, the history) only corrects them.
+is a detector of photographs and `Lift`, which knows from the box where its object stands. They pass no layers of the
+decoder: the learned queries say what the BEV map knows, and which of both is believed is weighed in each frame.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.decoder import BOX_CODE_SIZE, DecoderConfig, DecoderLayer, branch
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
 from bevcli.model.pillar_projection import project_points
@@ -35,7 +34,6 @@ TRUSTED = 0.28, 0.38  # share of explained boxes, from no to full trust in the l
 DOUBT, YIELD = 2.0, 3.0  # taken from the logits of learned queries without trust, and of hybrid ones with full trust
 NEAREST_M = 0.3  # of the corners of a box that a camera sees
 LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
-RANGE_SCALE = 0.05  # of metres, as they enter a layer
 
 
 @dataclass(frozen=True)
@@ -43,46 +41,29 @@ class HybridQueriesConfig:
     """The [hybrid_queries] table of a model with a detector."""
 
     count: int = 0  # of queries, the best boxes of all cameras; 0 for none
-    layers: int = 0  # that correct them by the BEV map; with 0 they stay as `Lift` gives them
     # whether the rig of each frame is levelled first, by the slope of the road that the boxes tell, where the detector
     # stands beside the backbone: the vehicle pitches and rolls, and poses rarely state it
     level: bool = False
     features: int = 128  # channels of the detector's maps
 
     def __post_init__(self) -> None:
-        if self.count < 0 or self.layers < 0 or self.features < 1:
-            raise ValueError("count and layers must be 0 or more, features 1 or more")
+        if self.count < 0 or self.features < 1:
+            raise ValueError("count must be 0 or more, features 1 or more")
 
 
 class HybridQueries(nn.Module):
-    """Lifted boxes, corrected by what the BEV map knows. Without training they stay as `Lift` gives them."""
+    """Lifted boxes, as queries beside the learned ones."""
 
     range_start: Tensor
     range_extent: Tensor
     of_image: Tensor  # (7, groups)
     of_class: Tensor  # (classes, groups)
 
-    def __init__(
-        self,
-        config: HybridQueriesConfig,
-        decoder: DecoderConfig,
-        channels: int,
-        classes: tuple[str, ...],
-        grid: BevGrid,
-        height_m: float,
-    ) -> None:
-        """Random weights, without effect. height_m: of the bev frame above the ground."""
+    def __init__(self, config: HybridQueriesConfig, classes: tuple[str, ...], grid: BevGrid, height_m: float) -> None:
+        """Random weights. height_m: of the bev frame above the ground."""
         super().__init__()
-        self.config, shape = config, (grid.rows, grid.columns)
+        self.config = config
         self.lift = Lift(LiftConfig(), classes, config.features, -height_m)
-        self.layers = nn.ModuleList(DecoderLayer(decoder, channels, shape) for _ in range(config.layers))
-        if config.layers:
-            self.content = nn.Linear(config.features + len(IMAGE_CLASSES) + len(classes), channels)
-            self.position = branch(BOX_CODE_SIZE, 1, channels)
-            self.class_correction = nn.Linear(channels, len(classes))
-            self.box_correction = nn.Linear(channels, BOX_CODE_SIZE)
-            for weights in (*self.class_correction.parameters(), *self.box_correction.parameters()):
-                nn.init.zeros_(weights)
         of_image, of_class = ([GROUPS.get(name, 0) for name in names] for names in (IMAGE_CLASSES, classes))
         self.register_buffer("of_image", torch.eye(GROUP_COUNT)[of_image], persistent=False)
         self.register_buffer("of_class", torch.eye(GROUP_COUNT)[of_class], persistent=False)
@@ -90,43 +71,25 @@ class HybridQueries(nn.Module):
         self.register_buffer("range_start", ranges[:, 0], persistent=False)
         self.register_buffer("range_extent", ranges[:, 1] - ranges[:, 0], persistent=False)
 
+    @torch.no_grad()
     def forward(
-        self,
-        bev: Tensor,
-        boxes: ImageBoxes,
-        image_from_bev: Tensor,
-        sizes: Tensor,
-        slopes: RoadSlopes | None = None,
+        self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor, slopes: RoadSlopes | None = None
     ) -> tuple[Tensor, Tensor]:
         """Class logits (B, H, classes) and box codes (B, H, 10) of the hybrid queries.
 
         Args:
-            bev: (B, Y·X, C).
             boxes: of N cameras.
             image_from_bev: (B, N, 4, 4), bev metres to pixels of the network's input.
             sizes: (B, N, 2) width and height of the images within their padding, pixels.
             slopes: of the road that were expected, see `Lift`.
         """
-        with torch.no_grad():
-            logits, codes, _ = self.lift(boxes, image_from_bev, sizes, slopes)
-            place = (codes[..., :2] - self.range_start) / self.range_extent
-            is_inside = ((place > 0) & (place < 1)).all(-1, keepdim=True)
-            logits = logits.where(is_inside, NO_BOX)
-            missing = max(self.config.count - logits.shape[1], 0)  # of few cameras
-            logits, codes, place = (
-                F.pad(x, (0, 0, 0, missing), value=fill) for x, fill in ((logits, NO_BOX), (codes, 0.0), (place, 0.0))
-            )
-            best, index = logits.amax(-1).topk(self.config.count)
-            logits, codes = rows(logits, index), rows(codes, index).where(best[..., None] > NO_BOX, 0.0)
-            place = rows(place, index).clamp(0, 1)
-        if not self.config.layers:
-            return logits, codes
-        seen = rows(F.pad(torch.cat([boxes.features, boxes.logits], -1).flatten(1, 2), (0, 0, 0, missing)), index)
-        query = self.content(torch.cat([seen, logits], -1))
-        position = self.position(torch.cat([codes[..., :2] * RANGE_SCALE, codes[..., 2:]], -1))
-        for layer in self.layers:
-            query = layer(query, position, place, bev)
-        return logits + self.class_correction(query), codes + self.box_correction(query)
+        logits, codes, _ = self.lift(boxes, image_from_bev, sizes, slopes)
+        place = (codes[..., :2] - self.range_start) / self.range_extent
+        logits = logits.where(((place > 0) & (place < 1)).all(-1, keepdim=True), NO_BOX)
+        missing = max(self.config.count - logits.shape[1], 0)  # of few cameras
+        logits, codes = (F.pad(x, (0, 0, 0, missing), value=fill) for x, fill in ((logits, NO_BOX), (codes, 0.0)))
+        best, index = logits.amax(-1).topk(self.config.count)
+        return rows(logits, index), rows(codes, index).where(best[..., None] > NO_BOX, 0.0)
 
     @torch.no_grad()
     def levelled(

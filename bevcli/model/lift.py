@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
 from bevcli.model.road_slopes import SPREAD, RoadSlopes
+from bevcli.model.upright_images import adjugate_of_three
 
 NAMES = {"person": "pedestrian"}  # names of classes that are other ones in images
 # Of each image class: mean width, length and height of its objects, metres.
@@ -167,10 +168,8 @@ class Rays:
 
     def __init__(self, boxes: Tensor, image_from_bev: Tensor, ground_z: float) -> None:
         """boxes: pixels. image_from_bev: (B, N, 4, 4), pixels. ground_z: of the ground in the bev frame, metres."""
-        r0, r1, r2 = image_from_bev[..., :3, :3].unbind(-2)  # (B, N, 3)
-        # Columns of the adjugate matrix. The determinant is positive and scales all rays alike.
-        inverse = torch.stack([_cross(r1, r2), _cross(r2, r0), _cross(r0, r1)], -1)  # (B, N, 3, 3)
-        determinant = (r0 * inverse[..., 0]).sum(-1, keepdim=True)
+        inverse = adjugate_of_three(image_from_bev[..., :3, :3])  # its positive determinant scales all rays
+        determinant = (image_from_bev[..., 0, :3] * inverse[..., 0]).sum(-1, keepdim=True)
         self.camera = -(inverse * image_from_bev[..., None, :3, 3]).sum(-1) / determinant
         left, top, right, bottom = boxes.unbind(-1)
 
@@ -212,9 +211,3 @@ def hidden_feet(boxes: Tensor, scores: Tensor) -> Tensor:
     nearer = (b[..., 3] > a[..., 3] + 2) & (b[..., 1] < a[..., 3])
     share = both[..., 0] / (a[..., 2] - a[..., 0]).clamp(min=1)
     return (nearer * share * (1 - overlap) * scores[..., None, :]).amax(-1)
-
-
-def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """The cross product (..., 3)."""
-    (a0, a1, a2), (b0, b1, b2) = a.unbind(-1), b.unbind(-1)
-    return torch.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)

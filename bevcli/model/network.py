@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -23,6 +24,7 @@ from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.model.upload import on_device, upload_together, without_autocast
+from bevcli.model.upright_images import upright_images
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera
@@ -44,18 +46,15 @@ class Network(TemporalModel):
         self.image_detector = config.image_detector.build() if config.image_detector else None
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
+        hybrid, height_m = config.hybrid_queries, config.bev_frame.height_m
         embeds_rays = config.image_tokens.calibration_embedding
-        self.calibration_embedding = CalibrationEmbedding(channels, config.bev_frame.height_m) if embeds_rays else None
+        self.calibration_embedding = CalibrationEmbedding(channels, height_m) if embeds_rays else None
         self.bev_queries = BevQueries(grid, channels, config.ego_motion.can_bus)
         self.pillars = Pillars(grid)
         self.encoder = Encoder(config.encoder, channels, levels, grid, config.ego_motion)
         self.decoder = Decoder(config.decoder, channels, bev_shape)
         self.detection_head = DetectionHead(config.decoder.layers, channels, len(config.classes), grid)
-        hybrid, decoder = config.hybrid_queries, config.decoder
-        self.hybrid_queries = None
-        if hybrid.count:
-            height_m = config.bev_frame.height_m
-            self.hybrid_queries = HybridQueries(hybrid, decoder, channels, config.classes, grid, height_m)
+        self.hybrid_queries = HybridQueries(hybrid, config.classes, grid, height_m) if hybrid.count else None
         segments = "segmentation" in config.heads
         self.segmentation_head = SegmentationHead(config.segmentation, channels, bev_shape) if segments else None
 
@@ -66,12 +65,22 @@ class Network(TemporalModel):
         """
         return self.tokens_of(self.image_maps(images), camera_index)
 
-    def image_maps(self, images: Tensor) -> list[Tensor]:
-        """The maps of the backbone for B·N images. images: (B, N, 3, H, W), normalised, padded."""
-        images, (smaller, whole) = images.flatten(0, 1), self.config.backbone_scale
-        if smaller < whole:
-            size = [extent * smaller // whole for extent in images.shape[-2:]]
-            images = F.interpolate(images, size, mode="bilinear", align_corners=False)
+    def image_maps(
+        self, images: Tensor, image_from_upright: Tensor | None = None, sizes: Tensor | None = None
+    ) -> list[Tensor]:
+        """The maps of the backbone for B·N images. images: (B, N, 3, H, W), normalised, padded.
+
+        image_from_upright, sizes: turn the images first, see `upright_images`.
+        """
+        smaller, whole = self.config.backbone_scale
+        size = [extent * smaller // whole for extent in images.shape[-2:]]
+        if image_from_upright is not None and sizes is not None:
+            images = upright_images(images, image_from_upright, sizes, size)
+            images = images.contiguous(memory_format=torch.channels_last)
+        elif smaller < whole:
+            images = F.interpolate(images.flatten(0, 1), size, mode="bilinear", align_corners=False)
+        else:
+            images = images.flatten(0, 1)
         maps: list[Tensor] = self.backbone(images)
         return maps
 
@@ -134,9 +143,7 @@ class Network(TemporalModel):
         outputs = self.detect(bev)
         if self.hybrid_queries is not None and boxes is not None:
             with without_autocast(bev.device):
-                hybrid_logits, hybrid_codes = self.hybrid_queries(
-                    bev.float(), boxes, image_from_bev, image_sizes, expected
-                )
+                hybrid_logits, hybrid_codes = self.hybrid_queries(boxes, image_from_bev, image_sizes, expected)
                 learned = outputs.class_logits, outputs.box_codes
                 cameras = image_from_level, image_sizes
                 logits, hybrid_logits = self.hybrid_queries.weighed(learned, hybrid_logits, boxes, cameras)
@@ -169,9 +176,6 @@ class Network(TemporalModel):
         yield f"detection head: {layers} class branches", "detection_head.class_branches"
         yield f"detection head: {layers} box branches", "detection_head.box_branches"
         yield "hybrid queries: lift of boxes in images", "hybrid_queries.lift"
-        yield "hybrid queries: content, position", "hybrid_queries.content", "hybrid_queries.position"
-        yield "hybrid queries: layers", "hybrid_queries.layers"
-        yield "hybrid queries: corrections", "hybrid_queries.class_correction", "hybrid_queries.box_correction"
         yield "segmentation: stuff queries", "segmentation_head.stuff_queries"
         yield "segmentation: location decoder", "segmentation_head.location_decoder"
         for layer in range(self.config.segmentation.mask_layers):

@@ -16,6 +16,7 @@ from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.road_slopes import RoadMemory, RoadSlopes, expected_slopes
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import on_device, upload, upload_together
+from bevcli.model.upright_images import upright_cameras
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class EncoderInputs:
     rotation: Tensor | None  # (B, 2, 3), of the history, see `map_rotation`; None without history
     image_boxes: ImageBoxes | None = None  # of a detector beside the backbone, None without one
     expected_slopes: RoadSlopes | None = None  # see `ModelInputs`
+    image_from_upright: Tensor | None = None  # (B, N, 3, 3), see `upright_images`; None: the images stay as they are
 
 
 class BEVFormer(Network):
@@ -87,11 +89,14 @@ class BEVFormer(Network):
         Arguments as for `forward`.
         """
         size = inputs.image_size
-        rays = rotation = None
+        rays = rotation = image_from_upright = None
         cameras = inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes
         boxes, image_from_level, slopes = self.look(*cameras, inputs.expected_slopes)
+        upright_from_level = image_from_level
+        if slopes is not None:
+            upright_from_level, image_from_upright = upright_cameras(inputs.image_from_bev, image_from_level)
         if self.calibration_embedding is not None:
-            rays = self.calibration_embedding(image_from_level, self.config.level_shapes_of(size), size)
+            rays = self.calibration_embedding(upright_from_level, self.config.level_shapes_of(size), size)
         if history is not None:
             center = self.config.ego_motion.history_rotation_center
             rotation = map_rotation(inputs.rotation_deg, self.config.bev_grid, center)
@@ -104,12 +109,13 @@ class BEVFormer(Network):
             image_sizes=inputs.image_sizes,
             can_bus=inputs.can_bus,
             shift=inputs.shift,
-            hits=self.pillars(image_from_level, size, inputs.has_image),
+            hits=self.pillars(upright_from_level, size, inputs.has_image),
             rays=rays,
             history=history,
             rotation=rotation,
             image_boxes=boxes,
             expected_slopes=inputs.expected_slopes,
+            image_from_upright=image_from_upright,
         )
         return encoder_inputs, slopes
 
@@ -117,7 +123,7 @@ class BEVFormer(Network):
     def compute(self, inputs: EncoderInputs, heads: bool = True) -> Any:
         """The device part of a step (the paper's figure 2): its outputs, or without `heads` the BEV map (B, Y·X, C)."""
         inputs = upload_together(inputs, self.device)
-        maps = self.image_maps(inputs.images)
+        maps = self.image_maps(inputs.images, inputs.image_from_upright, inputs.image_sizes)
         image_features = self.tokens_of(maps, inputs.camera_index)
         if inputs.rays is not None:
             image_features = image_features.scaled(*inputs.rays)

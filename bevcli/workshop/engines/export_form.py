@@ -20,6 +20,7 @@ from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.road_slopes import SPREAD, RoadSlopes
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
+from bevcli.model.upright_images import upright_cameras
 
 Output = TypeVar("Output")
 
@@ -122,10 +123,13 @@ class RecurrentStep(ExportedStep):
         if expected_slopes is not None and expected_covariance is not None:
             expected = RoadSlopes(expected_slopes, expected_covariance)
         boxes, image_from_level, slopes = network.look(images, has_image, image_from_bev, image_sizes, expected)
-        maps = network.image_maps(images)
+        upright_from_level, image_from_upright = image_from_level, None
+        if slopes is not None:
+            upright_from_level, image_from_upright = upright_cameras(image_from_bev, image_from_level)
+        maps = network.image_maps(images, image_from_upright, image_sizes)
         image_features = network.tokens_of(maps, camera_index)
         if network.calibration_embedding is not None:
-            rays = image_from_level, image_features.level_shapes, self.image_size
+            rays = upright_from_level, image_features.level_shapes, self.image_size
             image_features = image_features.scaled(*network.calibration_embedding(*rays))
         bev_query = network.bev_queries(can_bus)
         position = network.bev_queries.position()
@@ -133,7 +137,7 @@ class RecurrentStep(ExportedStep):
         history = rotate_history(previous_bev, rotation, self.config.bev_grid, center)
         centers = network.encoder.cell_centers.expand(1, 2, -1, -1)
         reference_points = torch.where(use_previous, network.encoder.reference_points(shift), centers)
-        hits = self.hits(image_from_level, has_image)
+        hits = self.hits(upright_from_level, has_image)
         with_history = torch.stack([history, bev_query], dim=1)
         bev = bev_query
         for layer in network.encoder.layers:

@@ -465,10 +465,6 @@ class FrameLosses:
         weights, own = self.configs.detection_loss, outputs.class_logits.shape[2] - self._hybrid_queries
         logits, codes = outputs.class_logits[:, :, :own], outputs.box_codes[:, :, :own]
         terms = losses.detection_loss(logits, codes, targets.detection, weights, self._query_groups)
-        if self._hybrid_queries:  # a group of its own, which finds every object too
-            hybrid = outputs.class_logits[-1:, :, own:], outputs.box_codes[-1:, :, own:]
-            found = losses.detection_loss(*hybrid, targets.detection, weights)
-            terms |= {f"hybrid {name}": term for name, term in found.items()}
         if self._dense_head is not None:
             bev, config = outputs.bev.float(), self.configs.dense_loss
             terms |= losses.dense_loss(self._dense_head, bev, targets.detection, config, weights)
