@@ -13,7 +13,7 @@ GROUPS = {
         *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     ),
     "rendered": ("test_drive", "test_export", "test_random_rig", "test_material", "test_body", "test_catalog"),
-    "weights": ("test_checkpoints", "test_ego_motion_inputs", "test_system_errors"),
+    "weights": ("test_checkpoints", "test_ego_motion_inputs", "test_system_errors", "test_fetch"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.

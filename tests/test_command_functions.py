@@ -38,6 +38,9 @@ def test_convert_returns_what_was_written(folder: Path, tmp_path: Path) -> None:
     assert one.frames == 1
     with pytest.raises(InputError, match="unknown format"):
         bevcli.convert(source, tmp_path / "other", form="vhs")
+    target, what = bevcli.export(source / "ground_truth.json", form="csv", out=tmp_path / "boxes.csv")
+    assert (target, what) == (tmp_path / "boxes.csv", "6 boxes")
+    assert len(target.read_text().splitlines()) == 7
 
 
 def test_a_batch_is_a_function_of_drives_and_options(folder: Path, tmp_path: Path) -> None:
@@ -57,34 +60,13 @@ def test_a_batch_is_a_function_of_drives_and_options(folder: Path, tmp_path: Pat
 def test_train_and_validate_are_functions(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bevcli.workshop.training.trainer.draw_learning_curves", lambda loss, validation, path: None)
     drives = [folder / "drives/d000", str(folder / "drives/d001")]
-    weights = bevcli.train(
-        folder / "mini.toml",
-        data=drives,
-        out=tmp_path / "trained",
-        steps=1,
-        held_out=1,
-        device="cpu",
-    )
+    how = {"out": tmp_path / "trained", "steps": 1, "held_out": 1, "device": "cpu"}
+    weights = bevcli.train(folder / "mini.toml", data=drives, **how)
     assert weights.name == "weights.safetensors"
     model = bevcli.load_model(folder / "mini.toml", weights=weights)
     scores = bevcli.validate(model, data=drives[1], max_range=20)
     by_name = bevcli.validate(str(folder / "mini.toml"), weights=weights, data=drives[1], max_range=20)
     assert scores.table() == by_name.table()
-
-
-def test_options_that_a_function_lacks_are_named(folder: Path) -> None:
-    drives, model = [folder / "drives/d000"], bevcli.load_model(folder / "mini.toml", untrained=True)
-    with pytest.raises(TypeError, match=r"validate\(\) has no option weights"):
-        bevcli.validate(model, data=drives, weights="mini.pth")
-    with pytest.raises(TypeError, match=r"train\(\) has no option step: did you mean steps\?"):
-        bevcli.train("demo", data=drives, step=3)
-
-
-def test_export_returns_the_file_and_its_contents(folder: Path, tmp_path: Path) -> None:
-    truth = folder / "drives/d000/ground_truth.json"
-    target, what = bevcli.export(truth, form="csv", out=tmp_path / "boxes.csv")
-    assert (target, what) == (tmp_path / "boxes.csv", "6 boxes")
-    assert len(target.read_text().splitlines()) == 7
 
 
 @pytest.mark.slow
@@ -118,9 +100,14 @@ def test_a_screenshot_and_a_video_are_functions(folder: Path, tmp_path: Path) ->
     assert "CAM_FRONT" in views
 
 
-def test_keywords_are_spread_over_the_dataclasses_of_options() -> None:
+def test_keywords_are_spread_over_options_or_named(folder: Path) -> None:
     written, labels, left = spread({"form": "mcap", "labels": "a.csv", "speed": 3}, WriteOptions, LabelOptions)
     assert (written.form, labels.labels, left) == ("mcap", Path("a.csv"), {"speed": 3})
+    model = bevcli.load_model(folder / "mini.toml", untrained=True)
+    with pytest.raises(TypeError, match=r"validate\(\) has no option weights"):
+        bevcli.validate(model, data=folder, weights="mini.pth")
+    with pytest.raises(TypeError, match=r"train\(\) has no option step: did you mean steps\?"):
+        bevcli.train("demo", data=folder, step=3)
     refuse({}, "f", WriteOptions)
     with pytest.raises(TypeError, match=r"f\(\) has no option farm: did you mean form\?"):
         refuse({"farm": 1}, "f", WriteOptions)

@@ -29,22 +29,11 @@ def read_only(tmp_path: Path):
 
 
 def start(root: Path, temporary: Path) -> subprocess.CompletedProcess[str]:
-    environment = {
-        **{name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG"))},
-        "PYTHONPATH": str(root),
-        "HOME": "/dev/null/home",
-        "TMPDIR": str(temporary),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    return subprocess.run(
-        [sys.executable, "-c", CODE],
-        capture_output=True,
-        text=True,
-        env=environment,
-        cwd=root,
-        check=False,
-        timeout=120,
-    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "XDG"))}
+    environment |= {"PYTHONPATH": str(root), "HOME": "/dev/null/home", "TMPDIR": str(temporary)}
+    environment["PYTHONDONTWRITEBYTECODE"] = "1"
+    command = [sys.executable, "-c", CODE]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=root, check=False, timeout=120)
 
 
 @pytest.mark.slow

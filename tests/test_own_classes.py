@@ -48,13 +48,6 @@ def write(path: Path, names: tuple[str, ...], score: float | None = None, **head
     return path
 
 
-def test_a_models_file_states_its_classes() -> None:
-    config = config_of_table(table(), "my.toml")
-    assert config.object_classes == CLASSES
-    assert (CLASSES["PKW"].range_m, CLASSES["PKW"].gate_m) == (60.0, NUSCENES_CLASSES["car"].gate_m)
-    assert config_of_table(as_table(config), "my.toml") == config
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -72,12 +65,15 @@ def test_wrong_classes_are_one_clear_line(changes: dict, message: str) -> None:
         config_of_table(table(**changes), "my.toml")
 
 
-def test_the_ten_classes_keep_nuscenes_parameters() -> None:
+def test_a_models_file_states_its_classes_and_ten_keep_nuscenes_parameters() -> None:
+    config = config_of_table(table(), "my.toml")
+    assert config.object_classes == CLASSES
+    assert (CLASSES["PKW"].range_m, CLASSES["PKW"].gate_m) == (60.0, NUSCENES_CLASSES["car"].gate_m)
+    assert config_of_table(as_table(config), "my.toml") == config
     assert DetectionConfig.of(NUSCENES_CLASSES) == DetectionConfig()
     assert TrackingConfig.of(NUSCENES_CLASSES) == TrackingConfig()
-    assert list(TrackingConfig().class_ranges_m) == [
-        "bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck",
-    ]  # fmt: skip
+    names = ["bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck"]
+    assert list(TrackingConfig().class_ranges_m) == names
     assert are_nuscenes(load_config("demo").object_classes)
     assert not are_nuscenes(CLASSES)
 
@@ -92,12 +88,13 @@ def test_predictions_are_scored_with_their_own_classes(tmp_path: Path) -> None:
     assert any("not comparable to nuScenes'" in note for note in scores.notes)
     with pytest.raises(InputError, match=r'"truck" is not a class \(expected one of PKW, Lorry, person, deer'):
         evaluate(found, truth, class_map={"LKW": "truck"})
-
-
-def test_a_wrong_head_of_predictions_is_one_clear_line(tmp_path: Path) -> None:
-    found = write(tmp_path / "p.json", ("PKW",), 0.9, classes=["PKW", "PKW"])
+    scores = evaluate(write(tmp_path / "p.json", ("deer",), 0.9, classes=["deer"]), write(truth, ("deer",)))
+    assert np.isnan(scores.detection.overall.errors["attr_err"])  # a class without attributes has no such error
+    assert scores.detection.overall.mean_ap == pytest.approx(1)
+    assert CLASSES["deer"].undefined_errors == ("attr_err",)
+    wrong = write(tmp_path / "p.json", ("PKW",), 0.9, classes=["PKW", "PKW"])
     with pytest.raises(InputError, match=r'p\.json: "classes" or "class_settings" is wrong: .* twice'):
-        evaluate(found, found)
+        evaluate(wrong, wrong)
 
 
 def test_attributes_gates_and_types_follow_the_class_it_is_like() -> None:
@@ -128,12 +125,3 @@ def test_names_are_compared_to_the_models_classes() -> None:
     (note,) = names.note({"bus": 3, "PKW": 2}, "my_drive")
     assert note.startswith("my_drive: 3 boxes have other classes and are not scored: bus (3)")
     assert "bus=PKW" in note
-
-
-def test_a_class_without_attributes_has_no_attribute_error(tmp_path: Path) -> None:
-    found = write(tmp_path / "p.json", ("deer",), 0.9, classes=["deer"])
-    truth = write(tmp_path / "t.json", ("deer",))
-    scores = evaluate(found, truth)
-    assert np.isnan(scores.detection.overall.errors["attr_err"])
-    assert scores.detection.overall.mean_ap == pytest.approx(1)
-    assert CLASSES["deer"].undefined_errors == ("attr_err",)

@@ -40,11 +40,9 @@ def test_errors_notes_and_progress_are_clean_and_short(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 3
     assert all(rf"column {SHOWN} xx" in line and len(line) < LONGEST_MESSAGE + 10 for line in lines)
-
-
-def test_a_table_keeps_its_lines(capsys):
-    say("boxes\t1\nmodel\t\x1b[2J")
+    say("boxes\t1\nmodel\t\x1b[2J")  # a table keeps its lines
     assert capsys.readouterr().out == "boxes\t1\nmodel\t\\x1b[2J\n"
+    assert [counted(count, "cameras") for count in (0, 1, 6)] == ["0 cameras", "1 camera", "6 cameras"]
 
 
 def test_a_column_name_cannot_steer_the_terminal(tmp_path):
@@ -58,16 +56,9 @@ def test_a_column_name_cannot_steer_the_terminal(tmp_path):
     assert r'unknown column "\x1b]0;owned\x07yyy' in done.stderr
     assert "\x1b" not in done.stderr
     assert len(done.stderr) < LONGEST_MESSAGE + 10
-
-
-def test_an_error_of_the_system_is_clean(tmp_path):
-    done = command(tmp_path, "convert", SAMPLE, "out\x1b[2J" + "x" * 300)
+    done = command(tmp_path, "convert", SAMPLE, "out\x1b[2J" + "x" * 300)  # an error of the system
     assert done.returncode == 1
     assert r"out\x1b[2Jxxx" in done.stderr
-
-
-def test_one_thing_is_no_plural():
-    assert [counted(count, "cameras") for count in (0, 1, 6)] == ["0 cameras", "1 camera", "6 cameras"]
 
 
 def test_an_error_shortens_a_text_of_a_file_and_keeps_what_to_do():

@@ -16,10 +16,7 @@ def test_a_written_file_has_its_name_and_leaves_nothing_else(tmp_path):
     write_whole(tmp_path / "new" / "file.txt", b"text", parents=True)
     assert (tmp_path / "new" / "file.txt").read_bytes() == b"text"
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["file.txt"]
-
-
-def test_the_umask_gives_the_mode_of_a_file(tmp_path):
-    before = os.umask(0o027)
+    before = os.umask(0o027)  # which gives the mode of a file
     try:
         with whole_file(tmp_path / "file") as unfinished:
             unfinished.touch(mode=0o600)
@@ -74,29 +71,22 @@ def test_two_processes_that_write_a_file_each_write_the_whole(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
 
 
-def test_a_link_is_replaced_and_its_target_stays(tmp_path):
+def test_a_link_is_replaced_and_a_pipe_written_directly(tmp_path):
     target, link = tmp_path / "target", tmp_path / "link"
     target.write_text("old")
     link.symlink_to(target)
     write_whole(link, b"new")
     assert (target.read_text(), link.read_text(), link.is_symlink()) == ("old", "new", False)
-
-
-def test_a_pipe_is_written_directly(tmp_path):
-    pipe = tmp_path / "pipe"
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_whole(tmp_path, b"")  # a folder
+    pipe, found = tmp_path / "pipe", []
     os.mkfifo(pipe)
-    found = []
     reader = threading.Thread(target=lambda: found.append(pipe.read_bytes()))
     reader.start()
     write_whole(pipe, b"text")
     reader.join(10)
     assert found == [b"text"]
     assert pipe.is_fifo()
-
-
-def test_a_folder_in_the_place_of_a_file_is_one_line(tmp_path):
-    with pytest.raises(OutputError, match="cannot be written"):
-        write_whole(tmp_path, b"")
 
 
 def test_an_input_is_not_replaced(tmp_path):
