@@ -14,9 +14,8 @@ from bevcli.runs.run_into_folder import RunOptions
 from bevcli.workshop.batch.job import Job
 from bevcli.workshop.formats.output import NativeWriter
 
-RIG = CameraRig(
-    tuple(make_camera(name, yaw, 80, 45) for name, yaw in NUSCENES_YAWS_DEG.items()), default_ego_from_bev()
-)
+CAMERAS = tuple(make_camera(name, yaw, 80, 45) for name, yaw in NUSCENES_YAWS_DEG.items())
+RIG = CameraRig(CAMERAS, default_ego_from_bev())
 
 
 class SmallDrive(MemoryDrive):

@@ -87,7 +87,7 @@ def put(path, value):
 
 DELETE = object()
 CAMERA = ("cameras", "CAM_BACK")
-POSE = (*CAMERA, "ego_from_camera")
+POSE, INTRINSICS, LENS = ((*CAMERA, name) for name in ("ego_from_camera", "intrinsics", "distortion"))
 EYE = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
 
 
@@ -111,31 +111,23 @@ MISTAKES = {
     "width is text": (put((*CAMERA, "width"), "1600"), 'camera CAM_BACK: "width".*1600'),
     "width is zero": (put((*CAMERA, "width"), 0), 'camera CAM_BACK: "width"'),
     "height is true": (put((*CAMERA, "height"), True), 'camera CAM_BACK: "height"'),
-    "no intrinsics": (
-        put((*CAMERA, "intrinsics"), DELETE), r'camera CAM_BACK: "intrinsics" is missing \(expected 3x3\)$',
-    ),
-    "intrinsics 2x3": (put((*CAMERA, "intrinsics"), EYE[:2]), "CAM_BACK.*expected 3x3, found 2x3"),
-    "intrinsics ragged": (put((*CAMERA, "intrinsics"), [[1, 0], [0], [1]]), "CAM_BACK.*expected 3x3"),
-    "intrinsics of text": (put((*CAMERA, "intrinsics"), [["a"] * 3] * 3), "CAM_BACK.*not an array of numbers"),
-    "intrinsics NaN": (put((*CAMERA, "intrinsics"), [[float("nan")] * 3] * 3), "CAM_BACK.*NaN"),
-    "intrinsics singular": (
-        put((*CAMERA, "intrinsics"), [[0, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*singular.*fx 0",
-    ),
-    "intrinsics mirrored": (
-        put((*CAMERA, "intrinsics"), [[-800, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*fx > 0",
-    ),
+    "no intrinsics": (put(INTRINSICS, DELETE), r'camera CAM_BACK: "intrinsics" is missing \(expected 3x3\)$'),
+    "intrinsics 2x3": (put(INTRINSICS, EYE[:2]), "CAM_BACK.*expected 3x3, found 2x3"),
+    "intrinsics ragged": (put(INTRINSICS, [[1, 0], [0], [1]]), "CAM_BACK.*expected 3x3"),
+    "intrinsics of text": (put(INTRINSICS, [["a"] * 3] * 3), "CAM_BACK.*not an array of numbers"),
+    "intrinsics NaN": (put(INTRINSICS, [[float("nan")] * 3] * 3), "CAM_BACK.*NaN"),
+    "intrinsics singular": (put(INTRINSICS, [[0, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*singular.*fx 0"),
+    "intrinsics mirrored": (put(INTRINSICS, [[-800, 0, 800], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*fx > 0"),
     "intrinsics transposed": (
-        put((*CAMERA, "intrinsics"), [[800, 0, 0], [0, 800, 0], [800, 450, 1]]), "CAM_BACK.*not a camera matrix",
+        put(INTRINSICS, [[800, 0, 0], [0, 800, 0], [800, 450, 1]]), "CAM_BACK.*not a camera matrix",
     ),
     "focal length in mm": (
-        put((*CAMERA, "intrinsics"), [[4.2, 0, 800], [0, 4.2, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal.*4.2",
+        put(INTRINSICS, [[4.2, 0, 800], [0, 4.2, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal.*4.2",
     ),
     "focal length too long": (
-        put((*CAMERA, "intrinsics"), [[8e5, 0, 800], [0, 8e5, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal length",
+        put(INTRINSICS, [[8e5, 0, 800], [0, 8e5, 450], [0, 0, 1]]), "CAM_BACK.*implausible focal length",
     ),
-    "principal point absurd": (
-        put((*CAMERA, "intrinsics"), [[800, 0, 8e5], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*principal point",
-    ),
+    "principal point absurd": (put(INTRINSICS, [[800, 0, 8e5], [0, 800, 450], [0, 0, 1]]), "CAM_BACK.*principal point"),
     "no pose": (put(POSE, DELETE), 'CAM_BACK: "ego_from_camera" is missing'),
     "pose is a list": (put(POSE, [1, 2, 3]), 'CAM_BACK: "ego_from_camera" is not a transform'),
     "no translation": (put((*POSE, "translation"), DELETE), 'CAM_BACK: "ego_from_camera.translation" is missing'),
@@ -149,18 +141,16 @@ MISTAKES = {
     "not orthonormal": (as_matrix([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]), "CAM_BACK.*not orthonormal.*0.01"),
     "left-handed": (as_matrix([[1, 0, 0], [0, 1, 0], [0, 0, -1]]), "CAM_BACK.*left-handed"),
     "a row of zeros": (as_matrix([[1, 0, 0], [0, 1, 0], [0, 0, 0]]), "CAM_BACK.*not orthonormal"),
-    "unknown lens": (put((*CAMERA, "distortion"), {"model": "fisheye"}), "CAM_BACK.*kannala_brandt, found fisheye"),
-    "lens is a list": (put((*CAMERA, "distortion"), [0.1, 0.2]), "CAM_BACK.*unknown model"),
+    "unknown lens": (put(LENS, {"model": "fisheye"}), "CAM_BACK.*kannala_brandt, found fisheye"),
+    "lens is a list": (put(LENS, [0.1, 0.2]), "CAM_BACK.*unknown model"),
     "three coefficients": (
-        put((*CAMERA, "distortion"), {"model": "brown_conrady", "coefficients": [0.1, 0.2, 0.3]}),
+        put(LENS, {"model": "brown_conrady", "coefficients": [0.1, 0.2, 0.3]}),
         "CAM_BACK.*expected 4 or 5 or 8 for brown_conrady, found 3",
     ),
-    "no coefficients": (put((*CAMERA, "distortion"), {"model": "kannala_brandt"}), "CAM_BACK.*expected 4.*found 0"),
-    "coefficients for none": (
-        put((*CAMERA, "distortion"), {"model": "none", "coefficients": [0.1]}), "CAM_BACK.*expected 0 for none",
-    ),
+    "no coefficients": (put(LENS, {"model": "kannala_brandt"}), "CAM_BACK.*expected 4.*found 0"),
+    "coefficients for none": (put(LENS, {"model": "none", "coefficients": [0.1]}), "CAM_BACK.*expected 0 for none"),
     "coefficient of text": (
-        put((*CAMERA, "distortion"), {"model": "kannala_brandt", "coefficients": [0.1, "b", 0, 0]}),
+        put(LENS, {"model": "kannala_brandt", "coefficients": [0.1, "b", 0, 0]}),
         'CAM_BACK: "distortion.coefficients" is not an array of numbers',
     ),
     "bev without translation": (put(("ego_from_bev", "translation"), DELETE), '"ego_from_bev.translation" is missing'),

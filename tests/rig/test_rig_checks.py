@@ -2,23 +2,9 @@
 
 import json
 
+import mistakes as made
 import pytest
 from healthy_rigs import HEALTHY, SIX, copy_of
-from mistakes import (
-    BEV_MISTAKES,
-    FIELD_MISTAKES,
-    LENS_MISTAKES,
-    LENS_WARNINGS,
-    POSE_MISTAKES,
-    both_rotations,
-    inverted,
-    millimetres,
-    pose_of,
-    rounded,
-    scaled,
-    set_pose,
-    xyzw,
-)
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import errors_of
@@ -49,9 +35,9 @@ def test_a_healthy_rig_gives_no_error(name, tmp_path):
     assert errors_of(report_of(copy_of(name), tmp_path).findings) == ()
 
 
-OF_ONE_CAMERA = [*POSE_MISTAKES, ("rotation-twice", both_rotations)]
+OF_ONE_CAMERA = [*made.POSE_MISTAKES, ("rotation-twice", made.both_rotations)]
 # A front camera's quaternion is nearly the same in either order, a back camera's is that of one upside down.
-XYZW = [(name, "quaternion-order", xyzw) for name in ALL if name.endswith(("LEFT", "RIGHT"))]
+XYZW = [(name, "quaternion-order", made.xyzw) for name in ALL if name.endswith(("LEFT", "RIGHT"))]
 
 
 @pytest.mark.parametrize(
@@ -59,7 +45,7 @@ XYZW = [(name, "quaternion-order", xyzw) for name in ALL if name.endswith(("LEFT
     [
         *(("CAM_BACK", *each) for each in OF_ONE_CAMERA),
         *XYZW,
-        ("CAM_FRONT_LEFT", "quaternion-norm", rounded),
+        ("CAM_FRONT_LEFT", "quaternion-norm", made.rounded),
         *(pytest.param(name, *each, marks=pytest.mark.slow) for name in OTHERS for each in OF_ONE_CAMERA),
     ],
 )
@@ -73,13 +59,13 @@ def test_one_camera_with_a_mistake_is_named(code, mistake, camera, tmp_path):
 OF_OTHER_RIGS = [
     pytest.param(rig, *mistake, marks=[pytest.mark.slow] * (rig != "lorry"))
     for rig in ("lorry", "five", "seven", "numbered")
-    for mistake in (*POSE_MISTAKES[:4], ("quaternion-order", xyzw))
+    for mistake in (*made.POSE_MISTAKES[:4], ("quaternion-order", made.xyzw))
 ]
 
 
 @pytest.mark.parametrize(
     ("rig", "code", "mistake"),
-    [*(("six", *each) for each in POSE_MISTAKES[:16]), ("six", "quaternion-order", xyzw), *OF_OTHER_RIGS],
+    [*(("six", *each) for each in made.POSE_MISTAKES[:16]), ("six", "quaternion-order", made.xyzw), *OF_OTHER_RIGS],
 )
 def test_a_mistake_in_all_cameras_is_one_error(rig, code, mistake, tmp_path):
     document = copy_of(rig)
@@ -93,7 +79,7 @@ def test_a_mistake_in_all_cameras_is_one_error(rig, code, mistake, tmp_path):
         assert [finding.code for finding in report_of(document, tmp_path).findings] == [code]
 
 
-@pytest.mark.parametrize(("code", "mistake"), [*LENS_MISTAKES, *FIELD_MISTAKES])
+@pytest.mark.parametrize(("code", "mistake"), [*made.LENS_MISTAKES, *made.FIELD_MISTAKES])
 @pytest.mark.parametrize("camera", ["CAM_FRONT", pytest.param("CAM_BACK", marks=pytest.mark.slow)])
 def test_one_camera_with_a_wrong_lens_is_named(code, mistake, camera, tmp_path):
     document = copy_of("six")
@@ -102,7 +88,7 @@ def test_one_camera_with_a_wrong_lens_is_named(code, mistake, camera, tmp_path):
     assert [(error.code, error.camera) for error in errors] == [(code, camera)]
 
 
-@pytest.mark.parametrize(("code", "mistake"), LENS_WARNINGS)
+@pytest.mark.parametrize(("code", "mistake"), made.LENS_WARNINGS)
 def test_an_unusual_lens_is_a_warning(code, mistake, tmp_path):
     document = copy_of("six")
     mistake(document["cameras"]["CAM_FRONT"])
@@ -113,7 +99,7 @@ def test_an_unusual_lens_is_a_warning(code, mistake, tmp_path):
 def test_the_message_names_the_image_size_of_the_intrinsics(tmp_path):
     document = copy_of("six")
     for camera in document["cameras"].values():
-        scaled(0.5)(camera)
+        made.scaled(0.5)(camera)
         camera["intrinsics"][0][2], camera["intrinsics"][1][2] = 400.0, 225.0
     (error,) = errors_in(document, tmp_path)
     assert error.camera is None
@@ -140,9 +126,9 @@ def test_cameras_with_one_pose_or_one_against_its_name(tmp_path):
     assert "CAM_FRONT_LEFT" in error.message
     document = copy_of("one")
     document["cameras"] = {"front": document["cameras"]["dashcam"]}
-    place, rotation = pose_of(document["cameras"]["front"]["ego_from_camera"])
+    place, rotation = made.pose_of(document["cameras"]["front"]["ego_from_camera"])
     around = Rotation.from_euler("z", 180, degrees=True)
-    set_pose(document["cameras"]["front"]["ego_from_camera"], place, around * rotation)
+    made.set_pose(document["cameras"]["front"]["ego_from_camera"], place, around * rotation)
     (error,) = errors_in(document, tmp_path)
     assert (error.code, error.camera) == ("name-against-pose", "front")
 
@@ -151,13 +137,13 @@ def test_an_ego_frame_with_y_forward(tmp_path):
     document = copy_of("six")
     turn = Rotation.from_euler("z", 90, degrees=True)  # ego x right, y forward: what was ahead is at 90 degrees
     for camera in document["cameras"].values():
-        place, rotation = pose_of(camera["ego_from_camera"])
-        set_pose(camera["ego_from_camera"], turn.apply(place), turn * rotation)
+        place, rotation = made.pose_of(camera["ego_from_camera"])
+        made.set_pose(camera["ego_from_camera"], turn.apply(place), turn * rotation)
     (error,) = errors_in(document, tmp_path)
     assert (error.code, error.camera) == ("ego-axes", None)
 
 
-@pytest.mark.parametrize(("code", "mistake"), BEV_MISTAKES)
+@pytest.mark.parametrize(("code", "mistake"), made.BEV_MISTAKES)
 def test_a_wrong_bev_frame(code, mistake, tmp_path):
     document = copy_of("six")
     mistake(document["ego_from_bev"])
@@ -170,8 +156,8 @@ def test_a_wrong_bev_frame(code, mistake, tmp_path):
 
 def test_two_mistakes_in_two_cameras_are_both_found(tmp_path):
     document = copy_of("six")
-    scaled(0.5)(document["cameras"]["CAM_BACK"])
-    millimetres(document["cameras"]["CAM_FRONT_LEFT"]["ego_from_camera"])
+    made.scaled(0.5)(document["cameras"]["CAM_BACK"])
+    made.millimetres(document["cameras"]["CAM_FRONT_LEFT"]["ego_from_camera"])
     errors = errors_in(document, tmp_path)
     assert {(error.code, error.camera) for error in errors} == {
         ("intrinsics-resolution", "CAM_BACK"),
@@ -183,7 +169,7 @@ def test_swapped_cameras_are_found_where_all_poses_are_inverted(tmp_path):
     document = copy_of("six")
     cameras = document["cameras"]
     for entry in cameras.values():
-        inverted(entry["ego_from_camera"])
+        made.inverted(entry["ego_from_camera"])
     front, back = cameras["CAM_FRONT"], cameras["CAM_BACK_LEFT"]
     front["ego_from_camera"], back["ego_from_camera"] = back["ego_from_camera"], front["ego_from_camera"]
     errors = errors_in(document, tmp_path)

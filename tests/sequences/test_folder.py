@@ -16,6 +16,8 @@ def test_stamps_are_the_rows_of_frames_csv(drive):
     assert {stamp.scene for stamp in sequence.stamps} == {""}
     assert sequence.name == "drive"
     assert open_sequence(str(drive)).stamps == sequence.stamps
+    (drive.parent / "link").symlink_to(drive)
+    assert open_sequence(drive.parent / "link").name == "drive"
 
 
 def test_poses_are_those_at_the_frame_and_at_each_camera(drive):
@@ -50,20 +52,17 @@ def test_times_beyond_float_precision_are_exact(edit):
     assert sequence.load(3).images["CAM_BACK"].timestamp_ns == 2**60 + 2
 
 
-def test_empty_cell_is_a_dropped_image(edit):
-    frame = open_sequence(edit("frames.csv", "images/CAM_BACK/1.png", "")).load(1)
-    assert list(frame.images) == ["CAM_FRONT"]
-    assert frame.dropped == {"CAM_BACK": "no image in frames.csv"}
-    assert set(frame.world_from_ego_at) == {"CAM_FRONT", "CAM_BACK"}
-
-
 @pytest.mark.parametrize("keep", [0, 40, -20], ids=["empty", "header", "cut short"])
-def test_broken_image_is_dropped_with_its_name(drive, keep):
+def test_broken_image_is_dropped_with_its_name(drive, edit, keep):
     path = drive / "images/CAM_BACK/1.png"
     path.write_bytes(path.read_bytes()[:keep])
     frame = open_sequence(drive).load(1)
     assert list(frame.images) == ["CAM_FRONT"]
     assert str(path) in frame.dropped["CAM_BACK"]
+    frame = open_sequence(edit("frames.csv", "images/CAM_BACK/1.png", "")).load(1)
+    assert list(frame.images) == ["CAM_FRONT"]
+    assert frame.dropped == {"CAM_BACK": "no image in frames.csv"}
+    assert set(frame.world_from_ego_at) == {"CAM_FRONT", "CAM_BACK"}
 
 
 def test_truncated_jpeg_is_dropped(drive, edit):
@@ -150,8 +149,3 @@ def test_exif_orientation_is_ignored(drive, edit):
     edit("frames.csv", "CAM_BACK/1.png", "CAM_BACK/1.jpg")
     assert open_sequence(drive).load(1).images["CAM_BACK"].pixels_bgr.shape == (36, 64, 3)
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (64, 36, 3)
-
-
-def test_sequence_behind_a_symlink_has_the_name_of_its_folder(drive, tmp_path):
-    (tmp_path / "link").symlink_to(drive)
-    assert open_sequence(tmp_path / "link").name == "drive"

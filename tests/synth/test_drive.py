@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from same_world import outside_of_boxes, projected, with_rig
+from shapely import Polygon
 
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
@@ -228,17 +229,11 @@ def test_vehicles_do_not_drive_through_each_other(assets: Assets):
 
 
 def _overlap(one: ActorState, other: ActorState, tolerance_m: float = 0.15) -> bool:
-    """Whether two boxes overlap on the ground by more than a tolerance, by the separating axis theorem."""
-    corners = []
+    """Whether two boxes that are smaller by a tolerance overlap on the ground."""
+    outlines = []
     for state in (one, other):
-        length, width = state.body.size_lwh[:2] / 2
+        length, width = state.body.size_lwh[:2] / 2 - tolerance_m / 2
         local = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])
         c, s = np.cos(state.yaw), np.sin(state.yaw)
-        corners.append(local @ np.array([[c, s], [-s, c]]) + state.position[:2])
-    for state in (one, other):
-        for angle in (state.yaw, state.yaw + np.pi / 2):
-            axis = np.array([np.cos(angle), np.sin(angle)])
-            a, b = (c @ axis for c in corners)
-            if min(a.max(), b.max()) - max(a.min(), b.min()) < tolerance_m:
-                return False
-    return True
+        outlines.append(Polygon(local @ np.array([[c, s], [-s, c]]) + state.position[:2]))
+    return outlines[0].intersects(outlines[1])

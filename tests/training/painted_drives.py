@@ -52,9 +52,7 @@ class PaintedDrive(Drive):
         self._all_labelled = all_labelled
         self.name = f"painted-{seed}"
         self.stamps = tuple(FrameStamp(i, self.name, 10**18 + i * 500_000_000) for i in range(2))
-        self._boxes = _boxes(
-            np.random.default_rng(seed)
-        )  # in the world frame, which is the bev frame of the second frame
+        self._boxes = _boxes(np.random.default_rng(seed))  # in the world frame, the bev frame of the second frame
 
     def load(self, index: int) -> Frame:
         """The frame at an index. Only the ego vehicle moves, 1 m forward."""
@@ -63,9 +61,8 @@ class PaintedDrive(Drive):
         images = {c.name: CameraImage(stamp.timestamp_ns, self._image(c, pose)) for c in RIG.cameras}
         still = Kinematics(np.array([0, 0, GRAVITY]), np.zeros(3), np.array([2.0, 0, 0]))
         frame = Frame(stamp, RIG, images, pose, dict.fromkeys(RIG.names, pose), still)
-        return (
-            replace(frame, ground_truth=self._boxes, ground_truth_map=_map()) if index or self._all_labelled else frame
-        )
+        labels = {"ground_truth": self._boxes, "ground_truth_map": _map()}
+        return replace(frame, **(labels if index or self._all_labelled else {}))
 
     def _image(self, camera: Camera, pose: Pose) -> np.ndarray:
         pixels = np.full((camera.height, camera.width, 3), 120, dtype=np.uint8)

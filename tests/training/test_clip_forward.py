@@ -54,9 +54,8 @@ def test_a_clip_gives_the_outputs_of_inference(config: BEVFormerV2Config, *, lea
             place = index if learn_all else index - 1
             if place >= 0:
                 torch.testing.assert_close(outputs[place].bev[drive], expected.bev[0], atol=2e-4, rtol=0)
-                torch.testing.assert_close(
-                    outputs[place].box_codes[:, drive], expected.box_codes[:, 0], atol=2e-3, rtol=0
-                )
+                codes = outputs[place].box_codes[:, drive]
+                torch.testing.assert_close(codes, expected.box_codes[:, 0], atol=2e-3, rtol=0)
 
 
 def test_the_earlier_frame_of_a_window_counts_without_gradient() -> None:

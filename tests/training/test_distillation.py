@@ -132,9 +132,7 @@ def test_a_model_learns_the_features_of_a_teacher(other_teacher: DistillationLos
 
 def test_a_teacher_with_other_maps_is_refused(model: BEVFormer, other_teacher: DistillationLossConfig) -> None:
     finer = BEVFormer(replace(CONFIG, backbone=replace(CONFIG.backbone, output_stages=(2,))))
-    with pytest.raises(
-        ConfigError, match=r"cannot teach painted: it has .* 6 x 8 cells, .* \(expected .* 12 x 16 cells"
-    ):
+    with pytest.raises(ConfigError, match=r"cannot teach painted: it has .* 6 x 8 cells, .*expected .* 12 x 16 cells"):
         Teacher(finer, other_teacher, torch.device("cpu"))
 
 

@@ -286,9 +286,8 @@ def test_half_a_row_of_a_full_disk_does_not_stop_a_training(two_steps: Trainer, 
 
 def test_one_folder_holds_one_training_at_a_time(tmp_path: Path) -> None:
     def prepare() -> TrainingJob:
-        return prepare_training(
-            "demo", torch.device("cpu"), DriveOptions(rendered=tuple(range(5))), TrainOptions(tmp_path)
-        )
+        drives = DriveOptions(rendered=tuple(range(5)))
+        return prepare_training("demo", torch.device("cpu"), drives, TrainOptions(tmp_path))
 
     with prepare().lock, pytest.raises(OutputError, match="is in use by another run"):
         prepare()

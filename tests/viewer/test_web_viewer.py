@@ -1,5 +1,6 @@
 """The web viewer's server: loopback only, one origin, any free port; and in a real browser."""
 
+import contextlib
 import http.client
 import os
 import re
@@ -40,10 +41,9 @@ def servers_end_soon():
         yield
 
 
-@pytest.fixture(scope="module")
-def viewer(tmp_path_factory):
-    recording = tmp_path_factory.mktemp("served") / "recording.rrd"
-    recording.write_bytes(b"RRF2 and so on")
+@contextlib.contextmanager
+def serving(recording: Path, content: bytes):
+    recording.write_bytes(content)
     viewer = WebViewer(PAGE, recording)
     thread = threading.Thread(target=viewer.serve)
     thread.start()
@@ -51,6 +51,12 @@ def viewer(tmp_path_factory):
     viewer.close()
     thread.join(5)
     assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("served") / "recording.rrd", b"RRF2 and so on") as viewer:
+        yield viewer
 
 
 def test_the_root_redirects_to_the_viewer_with_the_recording(viewer):
@@ -103,34 +109,27 @@ def test_silent_connections_end(viewer, monkeypatch):
 
 
 def test_a_reset_connection_prints_nothing(tmp_path, capfd):
-    recording = tmp_path / "recording.rrd"
-    recording.write_bytes(bytes(50_000_000))
-    viewer = WebViewer(PAGE, recording)
-    threading.Thread(target=viewer.serve, daemon=True).start()
-    for request in (b"GET /recording.rrd HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /rec"):
-        connection = socket.create_connection((viewer.host, viewer.port))
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close by a reset
-        connection.sendall(request)
-        time.sleep(0.1)
-        connection.close()
-    time.sleep(0.2)
-    viewer.close()
+    with serving(tmp_path / "recording.rrd", bytes(50_000_000)) as viewer:
+        for request in (b"GET /recording.rrd HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET /rec"):
+            connection = socket.create_connection((viewer.host, viewer.port))
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close by a reset
+            connection.sendall(request)
+            time.sleep(0.1)
+            connection.close()
+        time.sleep(0.2)
     assert capfd.readouterr() == ("", "")
 
 
 def test_whatever_replaces_the_recording_is_not_served(tmp_path):
     recording = tmp_path / "recording.rrd"
-    recording.write_bytes(b"RRF2 shown")
     (tmp_path / "secret").write_bytes(b"secret")
-    viewer = WebViewer(PAGE, recording)
-    threading.Thread(target=viewer.serve, daemon=True).start()
-    for replace in (lambda: None, lambda: recording.symlink_to(tmp_path / "secret"), lambda: os.mkfifo(recording)):
-        recording.unlink()
-        replace()
-        with urllib.request.urlopen(viewer.address + "/recording.rrd", timeout=5) as answer:
-            assert answer.read() == b"RRF2 shown"
-        recording.touch()
-    viewer.close()
+    with serving(recording, b"RRF2 shown") as viewer:
+        for replace in (lambda: None, lambda: recording.symlink_to(tmp_path / "secret"), lambda: os.mkfifo(recording)):
+            recording.unlink()
+            replace()
+            with urllib.request.urlopen(viewer.address + "/recording.rrd", timeout=5) as answer:
+                assert answer.read() == b"RRF2 shown"
+            recording.touch()
 
 
 @pytest.mark.parametrize("make", [lambda path: None, os.mkfifo, Path.mkdir])
