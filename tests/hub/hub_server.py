@@ -11,7 +11,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 class Hub(BaseHTTPRequestHandler):
     """`commits`: commit -> file -> content, of the repository team/model, whose branch main is the last commit.
 
-    `lies`: headers that take the place of the true ones. `pause_s`: before each byte of a body.
+    `lies`: headers that take the place of the true ones. `pause_s`: before each byte of a body; negative: headers
+    trickle.
     """
 
     protocol_version = "HTTP/1.1"
@@ -32,6 +33,9 @@ class Hub(BaseHTTPRequestHandler):
 
     def answer(self, *, with_body: bool) -> None:
         self.asked.append(f"{self.command} {self.path}")
+        while self.pause_s < 0:
+            self.wfile.write(b"H")
+            time.sleep(0.05)
         parts = self.path.strip("/").split("/")
         if parts[0] == "api":
             self.send(b"{}", with_body=with_body)

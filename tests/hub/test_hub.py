@@ -173,18 +173,20 @@ def test_a_server_names_no_file_outside_the_cache(hub, tmp_path, header, name):
 
 
 @pytest.mark.parametrize(
-    ("lies", "said"),
+    ("lies", "pause_s", "said"),
     [
-        ({"Retry-After": "100000"}, "too many requests: try again in 100000 s"),
-        ({"Content-Length": "1" + "0" * 15}, r"the server sends more than 4,294,967,296 bytes: refused"),
-        ({}, "slower than 4096 bytes a second"),
+        ({"Retry-After": "100000"}, 0, "too many requests: try again in 100000 s"),
+        ({"Content-Length": "1" + "0" * 15}, 0, r"the server sends more than 4,294,967,296 bytes: refused"),
+        ({}, 0.1, "slower than 4096 bytes a second"),
+        ({}, -1, "no answer within 0.3 s"),
     ],
 )
-def test_a_server_lets_nobody_wait(hub, monkeypatch, lies, said):
+def test_a_server_lets_nobody_wait(hub, monkeypatch, lies, pause_s, said):
     hub.lies.update(lies)
     hub.status = 429 if "Retry-After" in lies else 200
-    hub.pause_s = 0.0 if lies else 0.1
+    hub.pause_s = pause_s
     monkeypatch.setattr(fetch, "STALL_S", 0.2)
+    monkeypatch.setattr(fetch, "HEADERS_S", 0.3 if pause_s < 0 else 60)
     warnings.simplefilter("error")  # of huggingface_hub, beside the error
     with pytest.raises(WeightsError, match=f"hf:team/model: cannot be downloaded .*{said}"):
         load_model("hf:team/model")

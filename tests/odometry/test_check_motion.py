@@ -42,7 +42,7 @@ from bevcli.workshop.odometry.compare import (
 )
 from bevcli.workshop.odometry.measure import measure_motion
 
-STREET = Path(__file__).parents[2] / "samples/street"
+SAMPLES = Path(__file__).parents[2] / "samples"
 OFF = Finding("calibration-off", "warning", "CAM_FRONT", "does not fit how the vehicle moves")
 UNSEEN = Finding("motion-not-measured", "info", None, "the drive does not show its calibration")
 SCALE = Finding("motion-scale", "warning", None, "the poses have another scale than the images")
@@ -97,9 +97,12 @@ def test_what_fits_well_is_not_measured_any_further(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scale", "is_sound"), [(1.0, True), (1.05, False)])
-def test_a_few_frames_tell_that_the_sample_drive_is_sound(scale, is_sound):
-    drive = bevcli.open_sequence(STREET, ground_truth=False)
+@pytest.mark.parametrize(
+    ("sample", "scale", "is_sound"),
+    [("street", 1.0, True), ("street", 1.05, False), ("crossing", 1.0, True)],  # where two cameras are not measurable
+)
+def test_a_few_frames_tell_that_a_sample_drive_is_sound(sample, scale, is_sound):
+    drive = bevcli.open_sequence(SAMPLES / sample, ground_truth=False)
     drive.ego_motion = replace(drive.ego_motion, translations=scale * drive.ego_motion.translations)
     assert calibrate.last(calibrate.sound_steps(select(drive, chosen_frames(drive)))) == is_sound
 
@@ -147,7 +150,7 @@ def test_what_cannot_be_measured_is_said(monkeypatch):
 @pytest.fixture(scope="module")
 def street():
     """The sample drive, and what its images show."""
-    drive = bevcli.open_sequence(STREET, ground_truth=False)
+    drive = bevcli.open_sequence(SAMPLES / "street", ground_truth=False)
     return drive, measure_motion(select(drive, chosen_frames(drive)))
 
 

@@ -108,6 +108,10 @@ class Files(BaseHTTPRequestHandler):
         while not self.stop.wait(0.02):
             self.wfile.write(b"x" * 100)
 
+    def no_header_ends(self) -> None:
+        while not self.stop.wait(0.02):
+            self.wfile.write(b"H")
+
     def without_ranges(self) -> None:
         self.send(self.content[: len(self.content) * len(self.asked) // 2], ranges=False)
 

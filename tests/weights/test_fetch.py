@@ -147,14 +147,18 @@ def test_a_server_that_brings_nothing_is_left(server, model, tmp_path, how, requ
 
 
 @pytest.mark.parametrize(
-    ("limits", "reason"),
-    [({"WHOLE_S": 0.2}, "timed out"), ({"STALL_S": 0.2, "ATTEMPTS": 1, "STALL_BYTES": 1e9}, "slower than")],
+    ("how", "limits", "reason"),
+    [
+        ("slow_for_ever", {"WHOLE_S": 0.2}, "timed out"),
+        ("slow_for_ever", {"STALL_S": 0.2, "ATTEMPTS": 1, "STALL_BYTES": 1e9}, "slower than"),
+        ("no_header_ends", {"HEADERS_S": 0.2, "ATTEMPTS": 1}, "no answer within 0.2 s"),
+    ],
 )
-def test_a_slow_download_has_an_end(server, model, monkeypatch, limits, reason):
+def test_a_slow_download_has_an_end(server, model, monkeypatch, how, limits, reason):
     url, _ = server
     for name, value in limits.items():
         monkeypatch.setattr(fetch, name, value)
-    add_source(model, f"{url}/slow_for_ever/weights.safetensors")
+    add_source(model, f"{url}/{how}/weights.safetensors")
     with pytest.raises(WeightsError, match=rf"broke off \d times? \({reason}"):
         fetch_weights(named_weights("own"))
 

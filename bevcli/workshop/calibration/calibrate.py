@@ -428,8 +428,11 @@ def motion_steps(drive: Drive) -> Iterator[tuple[Finding, ...] | None]:
 
 
 SOUND_STEPS = READING_STEPS + 2  # of `sound_steps`
+SOUND_WIDTH = 800  # pixels, of the images: two thirds of the time of larger ones
 SOUND = 0.75  # share of the limits of findings within which nothing else is measured
-SURE_POINTS = 60  # of the road, of each pair
+SOUND_FINE = 2.0  # times FINE, however wide the deviation: so few frames do not measure every camera
+SURE_SHARES = 0.7, 0.5  # of the matches, that fit as stated: of each pair, of each camera
+SURE_POINTS = 30  # of the road, of each pair
 SURE_HEIGHT_M = 0.02  # deviation of the mean height, which also tells the scale of the poses
 
 
@@ -439,7 +442,7 @@ def sound_steps(drive: Drive) -> Iterator[bool | None]:
     In SOUND_STEPS parts: None after each of them but the last, then False where `motion_steps` has to tell more.
     """
     try:
-        views = yield from read_views(drive, SHORT_PAIRS)
+        views = yield from read_views(drive, SHORT_PAIRS, SOUND_WIDTH)
     except InputError:
         yield False
         return
@@ -450,11 +453,13 @@ def sound_steps(drive: Drive) -> Iterator[bool | None]:
     x = np.zeros(len(unknowns.deviations))
     points = consistent(unknowns, matches, x)
     road = road_residuals(views, unknowns, x, FLOWS_PX[-1], np.zeros(unknowns.cameras))
-    # Most matches of each pair fit where it turns as stated, and its road where it moves as far.
-    matched, fit, on_road = (
-        np.bincount(unknowns.groups[some.group, 0], minlength=unknowns.pairs) for some in (matches, points, road)
-    )
-    if not ((fit >= MOSTLY * matched) & (on_road >= SURE_POINTS)).all():
+    # Most matches of each pair and camera fit where it turns as stated, and its road where it moves as far.
+    is_fit = [
+        (np.bincount(of[points.group], minlength=n) >= share * np.bincount(of[matches.group], minlength=n)).all()
+        for of, n, share in zip(unknowns.groups.T, (unknowns.pairs, unknowns.cameras), SURE_SHARES, strict=False)
+    ]
+    on_road = np.bincount(unknowns.groups[road.group, 0], minlength=unknowns.pairs)
+    if not all(is_fit) or on_road.min() < SURE_POINTS:
         yield False
         return
     terms = _terms(unknowns, (points, depths_of(unknowns, matches), road), x, ROAD_SCALES_PX[-1])
@@ -462,14 +467,15 @@ def sound_steps(drive: Drive) -> Iterator[bool | None]:
 
 
 def _is_sound(result: CalibrationResult) -> bool:
-    """True where all is measured, and far from what would be a finding."""
+    """True where most cameras are measured, and all are far from what would be a finding."""
     change = np.abs([estimate.change for estimate in result.cameras])
     deviations = np.sqrt([np.diag(estimate.covariance) for estimate in result.cameras])
     certain, least_ms = CERTAIN_DELAY
-    limits = np.maximum([*FINE, least_ms / 1000], deviations * [*[FINE_DEVIATIONS] * len(FINE), certain])
-    is_fine = all(estimate.verdict is Verdict.FINE for estimate in result.cameras)
+    limits = np.maximum([*FINE, least_ms / 1000], deviations * [*[FINE_DEVIATIONS] * len(FINE), certain]) * SOUND
+    limits[:, : len(FINE)] = np.minimum(limits[:, : len(FINE)], SOUND_FINE * FINE)
+    measured = sum(estimate.verdict is Verdict.FINE for estimate in result.cameras)
     is_sure = result.whole.height_deviation_m < SURE_HEIGHT_M and not findings_of(result.cameras, result.interval_ms)
-    return is_fine and is_sure and bool((change <= SOUND * limits).all())
+    return is_sure and 2 * measured > len(result.cameras) and bool((change <= limits).all())
 
 
 def findings_of(cameras: Sequence[CameraEstimate], interval_ms: float | None = None) -> tuple[Finding, ...]:

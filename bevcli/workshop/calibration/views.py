@@ -15,7 +15,16 @@ from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import DELAYS_S, OF_PAIR, Unknowns
-from bevcli.workshop.correspondence.points import THREADS, GreyImage, features, grey_image, matched, neighbours, reduced
+from bevcli.workshop.correspondence.points import (
+    THREADS,
+    WIDTH,
+    GreyImage,
+    features,
+    grey_image,
+    matched,
+    neighbours,
+    reduced,
+)
 from bevcli.workshop.correspondence.residuals import DepthResiduals, EpipolarResiduals
 
 NEAREST_M, FARTHEST_M = 0.8, 12.0  # distance driven between the frames of a pair
@@ -78,10 +87,10 @@ class Views:
         return self.of[a, first], self.of[b if moves else a, second]
 
 
-def read_views(drive: Drive, most_pairs: int) -> Generator[None, None, Views]:
+def read_views(drive: Drive, most_pairs: int, width: int = WIDTH) -> Generator[None, None, Views]:
     """The views of a drive: yields READING_STEPS times while it is read, and returns them.
 
-    Raises InputError where the drive does not show how its cameras move.
+    width: of the reduced images, pixels. Raises InputError where the drive does not show how its cameras move.
     """
     _check(drive)
     pairs = _choose_pairs(_positions(drive), most_pairs)
@@ -95,7 +104,8 @@ def read_views(drive: Drive, most_pairs: int) -> Generator[None, None, Views]:
     for done, frame_index in enumerate(frames, 1):
         frame = drive.load(frame_index)
         if done == 1:
-            stated_rig, rig = frame.rig, replace(frame.rig, cameras=tuple(map(reduced, frame.rig.cameras)))
+            stated_rig = frame.rig
+            rig = replace(frame.rig, cameras=tuple(reduced(camera, width) for camera in frame.rig.cameras))
         for index, camera in enumerate(rig.cameras):
             view = _view(frame, camera, drive.ego_motion)
             if view is not None:

@@ -9,14 +9,16 @@ import os
 import re
 import shutil
 import ssl
+import threading
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import partial
 from http.client import HTTPException, HTTPResponse, InvalidURL
 from itertools import count
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 from urllib.error import HTTPError, URLError
 from urllib.request import HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
@@ -32,6 +34,7 @@ from bevcli.writing import lock, output_errors
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 STALL_S, STALL_BYTES = 20, 4096  # a transfer that is slower than so many bytes in a second, for so long, is cut
+HEADERS_S = 60  # for the headers of an answer, however they trickle
 WHOLE_S = 12 * 3600  # for all attempts
 ATTEMPTS = 5  # that fail; one that brings a LEAST_SHARE-th of the file or more does not count
 LEAST_SHARE = 16
@@ -190,6 +193,23 @@ def steady(parts: Iterable[bytes]) -> Iterator[bytes]:
             began, came = now, 0
 
 
+def answered(send: Any, *arguments: Any, **options: Any) -> Any:
+    """The answer that `send` returns once its headers are there. Raises TimeoutError where they take too long."""
+    answer: Future[Any] = Future()
+
+    def wait() -> None:
+        try:
+            answer.set_result(send(*arguments, **options))
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=wait, daemon=True).start()  # which nothing else ends: a byte now and then is no timeout
+    try:
+        return answer.result(HEADERS_S)
+    except TimeoutError as error:
+        raise TimeoutError(str(error) or f"no answer within {HEADERS_S} s") from None
+
+
 class Download:
     """A download of several attempts.
 
@@ -260,7 +280,7 @@ class Download:
             headers |= {"Range": f"bytes={self.done}-", "If-Range": part.tag}
         try:
             opener = build_opener(_Redirects, HTTPSHandler(context=ssl.create_default_context()))
-            return opener.open(Request(self.url, headers=headers), timeout=STALL_S)
+            return cast(HTTPResponse, answered(opener.open, Request(self.url, headers=headers), timeout=STALL_S))
         except HTTPError as error:
             error.close()
             if error.code < 400:

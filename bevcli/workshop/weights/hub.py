@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from bevcli.parsing.files import MIB, hash_of_file, is_file_name, read_bytes, re
 from bevcli.printing import one_line, reason_of
 from bevcli.published import HubModel, Known, all_weights
 from bevcli.workshop.weights import PackOptions
-from bevcli.workshop.weights.fetch import LENGTH_DIGITS, MOST_BYTES, steady
+from bevcli.workshop.weights.fetch import LENGTH_DIGITS, MOST_BYTES, answered, steady
 from bevcli.writing import write_whole
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
@@ -137,6 +137,7 @@ def _check_answers(hub: Any) -> None:
     def checking_client() -> Any:
         client = make_client()
         client.event_hooks["response"].append(_check)
+        client.send = partial(answered, client.send)
         return client
 
     checking_client.checks_names = True  # type: ignore[attr-defined]
@@ -146,7 +147,7 @@ def _check_answers(hub: Any) -> None:
 def _check(answer: Any) -> None:
     """Raise WeightsError where a server sends too much or lets wait, or a name in its headers leads out of its folder.
 
-    What it sends too slowly ends in a TimeoutError.
+    What it sends too slowly ends in a TimeoutError, as headers that do not come (`answered`).
     """
     host, headers = answer.request.url.host, answer.headers
     if answer.status_code == 429:  # huggingface_hub would wait as long as it is told
