@@ -22,6 +22,7 @@ from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
 from bevcli.workshop.training.samples import ClipConfig
+from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.training.validation import check_scored_drives, check_training_drives, run_drives
 
 CPU = torch.device("cpu")
@@ -212,8 +213,8 @@ def test_the_command_says_what_a_step_is_and_counts_updates(fleet: Path, tmp_pat
     assert list((tmp_path / "out" / "tensorboard").glob("events.out.tfevents.*"))
 
 
-def test_missing_images_of_a_scored_drive_are_told(
-    fleet: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_missing_images_are_told(
+    fleet: Path, prepare: Callable[..., TrainingJob], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     shutil.copytree(fleet / "d000", tmp_path / "d000")
     images = sorted(path for path in (tmp_path / "d000/images").rglob("*") if path.is_file())
@@ -223,3 +224,10 @@ def test_missing_images_of_a_scored_drive_are_told(
     frames = run_drives(model.runner(StepOptions()), FolderDrives((tmp_path / "d000",), model.config))
     assert sum(bool(frame.images) for _, frame, _ in frames) == 1
     assert f"d000: {len(images) - 1} images cannot be read" in caplog.text
+    caplog.clear()
+    job = prepare(str(tmp_path / "d000"), "d001", changes={"clips.batch": "3"})
+    assert [event.done for event in Trainer(job).run()] == [0, 1]
+    first, last = caplog.messages[0], caplog.messages[-1]
+    assert first.startswith("warning: d000, frame ")
+    assert first.endswith("black in training; all of these are counted at the end")
+    assert f"{len(images) - 1} images could not be read, and were black in training: d000, frame 0, " in last

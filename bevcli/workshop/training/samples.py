@@ -152,6 +152,7 @@ class Batch:
     targets: tuple[Targets, ...]  # of the last frames; fewer than inputs if the first ones are history only
     plain: "Batch | None" = None  # the same clips before augmentation, for a teacher; None without one
     distortions: tuple[Tensor, ...] = ()  # (B, N, 4) float32, of images in bytes; () where they are distorted
+    missing: tuple[str, ...] = ()  # images that cannot be read, for the user; only of a batch that was just made
 
     def to(self, device: torch.device) -> "Batch":
         """A copy on a device. Projections and poses stay on the CPU, which reads them without waiting for a GPU."""
@@ -187,7 +188,8 @@ def joined(batches: Sequence[Batch]) -> Batch:
     plain = [batch.plain for batch in batches if batch.plain is not None]
     world_from_bev = torch.cat([batch.world_from_bev for batch in batches], dim=1)
     distortions = tuple(map(torch.cat, zip(*(batch.distortions for batch in batches), strict=True)))
-    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None, distortions)
+    missing = tuple(text for batch in batches for text in batch.missing)
+    return Batch(inputs, world_from_bev, targets, joined(plain) if plain else None, distortions, missing)
 
 
 def _prepared(clip: list[Frame], config: ModelConfig, in_bytes: bool) -> list[PreparedFrame]:
@@ -281,7 +283,9 @@ class BatchMaker:
             for x, changes in zip(prepared, drawn, strict=True)
             if in_bytes and augmentation.photometric
         )
-        return Batch(inputs, world_from_bev, targets, plain, distortions)
+        lacking = [(x.stamp.index, name, why) for x in loaded for name, why in x.dropped.items()]
+        missing = tuple(f"{drive.name}, frame {index}, {name}: {why}" for index, name, why in lacking)
+        return Batch(inputs, world_from_bev, targets, plain, distortions, missing)
 
 
 def loaded_batches(

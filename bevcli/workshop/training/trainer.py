@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import logging
 import math
 import time
 from collections import deque
@@ -33,6 +34,7 @@ from bevcli.model.network import Network
 from bevcli.model.step import ModelOutputs
 from bevcli.options import refuse, spread
 from bevcli.parsing.pth import read_pth
+from bevcli.printing import counted, one_line
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import (
     Drives,
@@ -220,6 +222,7 @@ class Trainer:
         if job.config.optimizer.average > 0:
             self._average = {key: value.detach().clone() for key, value in job.model.state_dict().items()}
         self.done, self.waited_s = 0, 0.0
+        self._missing = set[str]()  # images of the clips
         if resume:
             self.done = load_checkpoint(job.out / CHECKPOINT, self.trained, self.optimizer, self._average)
             if self.done > job.config.steps:
@@ -251,6 +254,18 @@ class Trainer:
         Leaves the model in evaluation mode. To end early, leave the loop at the end of a step, after `save_checkpoint`.
         Raises BevcliError if a loss is not finite.
         """
+        try:
+            yield from self._run()
+        finally:
+            if self._missing:
+                count, texts = counted(len(self._missing), "images"), "; ".join(sorted(self._missing))
+                self._warn(f"{count} could not be read, and were black in training: {texts}")
+
+    @staticmethod
+    def _warn(text: str) -> None:
+        logging.getLogger("bevcli").warning("warning: %s", one_line(text))
+
+    def _run(self) -> Iterator[Progress]:
         job, config = self.job, self.job.config
         remaining, gpu = range(self.done, config.steps), job.device.type == "cuda"
         turns = product(remaining, range(config.clips.in_turn))
@@ -296,6 +311,9 @@ class Trainer:
             self.waited_s += time.perf_counter() - begun
             if batch is None:
                 return
+            if batch.missing and not self._missing:
+                self._warn(f"{batch.missing[0]}: black in training; all of these are counted at the end")
+            self._missing.update(batch.missing)
             yield batch
 
     def _step(self, batches: Iterable[Batch]) -> Iterator[dict[str, float]]:
