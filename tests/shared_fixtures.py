@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import cache
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,26 @@ from bevcli.model.resnet import ResNetConfig
 from bevcli.viewer import recording_file
 from bevcli.workshop.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
 from bevcli.workshop.vad.vad import VAD, LineDecoderConfig, MotionConfig, VADConfig
+
+SMALL_TINY = {
+    "size = [800, 450]": "size = [160, 90]",
+    "rows = 50": "rows = 12",
+    "columns = 50": "columns = 10",
+    "channels = 256": "channels = 32",
+    "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
+    "queries = 900": "queries = 30",
+}
+
+
+@pytest.fixture
+def small_model_file(tmp_path: Path) -> Path:
+    """The TOML file of tiny with changed lines."""
+    text = resources.files("bevcli").joinpath("configs/tiny.toml").read_text()
+    for old, new in SMALL_TINY.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "small.toml").write_text(text)
+    return tmp_path / "small.toml"
 
 
 @pytest.fixture(scope="session", autouse=True)

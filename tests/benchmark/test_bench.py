@@ -5,7 +5,6 @@ import runpy
 import subprocess
 from dataclasses import replace
 from functools import cache
-from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -18,26 +17,6 @@ from bevcli.inference.load import installed_engines
 from bevcli.workshop.benchmark import measure, versions
 from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits, count_operations
 from bevcli.workshop.benchmark.versions import Comparison
-
-SMALL = {
-    "size = [800, 450]": "size = [160, 90]",
-    "rows = 50": "rows = 12",
-    "columns = 50": "columns = 10",
-    "channels = 256": "channels = 32",
-    "blocks = [3, 4, 6, 3]": "blocks = [1, 1, 1, 1]\nwidth = 8",
-    "queries = 900": "queries = 30",
-}
-
-
-@pytest.fixture
-def small_model_file(tmp_path: Path) -> Path:
-    """The TOML file of tiny with changed lines."""
-    text = resources.files("bevcli").joinpath("configs/tiny.toml").read_text()
-    for old, new in SMALL.items():
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "small.toml").write_text(text)
-    return tmp_path / "small.toml"
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -6,15 +6,9 @@ import math
 import gpu_check
 import pytest
 import torch
-from benchmark.conftest import SMALL, model_file
 from simulated_device import simulated
 
 CPU = torch.device("cpu")
-
-
-@pytest.fixture
-def small_model_file(tmp_path):
-    return model_file(tmp_path / "small.toml", "tiny", SMALL)
 
 
 @pytest.mark.skipif(torch.cuda.is_available() or torch.backends.mps.is_available(), reason="there is a GPU")
