@@ -1,249 +1,347 @@
 """Faults of single cameras: how the points of each camera move in its images, against how the vehicle moves.
 
-One rule: the common mistakes are undone in turn. A camera whose points do not fit the stated poses gets the mistake
-after whose undoing they fit. All is measured by points of one camera in successive frames, so that one camera's mistake
-does not disturb another one. `bevcli calibrate` measures exactly what is named here.
+One rule: the common mistakes are undone in turn, and the one is named after whose undoing all points fit much better.
+Stated poses are exact enough for a model, but not for this: attitude and place of the vehicle at each frame are
+corrected a little first, until the points of all cameras but the one in question fit. Points are matched between
+successive images of a camera, and between images that two neighbours took at one time.
 """
 
-from collections.abc import Iterator, Mapping, Sequence as Items
+from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import t as student_t
 
 from bevcli.errors import Finding
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.workshop.correspondence.points import matched
+from bevcli.workshop.correspondence.points import matched, neighbours
 from bevcli.workshop.correspondence.poses import Poses
-from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry
+from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, solve
 from bevcli.workshop.odometry.step_views import FrameView
 
 LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
-PARALLAX_PX = 2.0  # a point that moves less has no depth
+PARALLAX_PX, FAR_PX = 2.0, 100.0  # a point that moves less has no depth; misfit of one that a lens cannot show
 SCALE_PX = 0.5  # a misfit of one point that counts half
-USUAL_SHARE = 0.6  # of points of the middle camera; below it the poses are too inexact to judge single cameras by
+SCALES_PX = (5.0, SCALE_PX)  # of the search for corrections, one after the other
+# How far off poses may be at a frame that are called sound, radians and metres: bodies pitch, and maps are flat.
+DEVIATIONS = np.array([np.radians(0.5)] * 3 + [0.05] * 3)
 LEAST_SHARE = 0.55  # of points that fit after a mistake is undone
-EXCHANGED, GAIN, SMALL = 0.2, 0.1, 0.08  # by how much more, if images of two are exchanged; mirrored or late; of others
-SURELY = 0.25  # the same of mirrored poses, and of late images where poses are inexact
+COARSE, SMALL = 0.1, 0.08  # by how much more than before, if images are another's, mirrored or late; of others
+SURELY = 0.25  # the same of mirrored poses, and of cameras whose points do not fit well even then
 FLIP = np.diag([1.0, -1.0, 1.0])
-COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains; those of sound cameras gain up to 5
-TURN, LEAST_TURN_DEG, MOST_TURN_DEG = np.radians(2), 1.0, 15.0  # usual wrong rotation; a told one
-LENGTHS, LEAST_LONGER = np.linspace(-0.36, 0.36, 13), 0.05  # logarithms of factors of a focal length; a told one
+COST_GAIN, COST_SHARE = 15.0, 0.05  # of the cost, that undoing a mistake gains: of all points; of a camera's, a share
+# Of a focal length, as a logarithm, and of a rotation, radians: a usual mistake, and the least one that is told.
+USUAL, LEAST = {1: 0.1, 3: np.radians(2)}, {1: 0.05, 3: np.radians(1)}
+CERTAIN = 0.995  # Student's quantile that these exceed in deviations, by the results without one frame
+ALIKE = 0.7  # of the gain of the likeliest mistake, with which another one of the same camera is told too
+ROUGH = 10.0  # times SCALE_PX, at which these are searched first
+STEPS, MOST = (1, 2), 600  # frames between two images that are compared; points of a camera or of two
 
 
 @dataclass(frozen=True)
-class CameraPoints:
-    """N matched points of one camera, each in the frames before and after a step."""
+class Side:
+    """N matched points in G images of one camera."""
 
     camera: Camera  # of the images
-    rays_a: Array  # (N, 3) unit directions in the first frame of the step, camera frame
-    rays_b: Array  # (N, 3) in the second one
-    times_ns: NDArray[np.int64]  # (N, 2) when both images were taken
-
-    def seen_by(self, camera: Camera) -> "CameraPoints":
-        """The points as if another camera had taken the images."""
-        rays_a, rays_b = (camera.rays(self.camera.project(each)[0]) for each in (self.rays_a, self.rays_b))
-        return CameraPoints(camera, rays_a, rays_b, self.times_ns)
-
-    def mirrored(self) -> "CameraPoints":
-        """The points of mirrored images."""
-        edge = np.array([self.camera.width - 1, 0])
-        pixels = (self.camera.project(each)[0] for each in (self.rays_a, self.rays_b))
-        rays_a, rays_b = (self.camera.rays(edge + each * (-1, 1)) for each in pixels)
-        return CameraPoints(self.camera, rays_a, rays_b, self.times_ns)
-
-    def turned(self, turn: Array) -> "CameraPoints":
-        """The points if the camera is turned by a rotation vector (3,) about its right, down and forward axes."""
-        pose = self.camera.ego_from_camera.copy()
-        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
-        return replace(self, camera=replace(self.camera, ego_from_camera=pose))
-
-    def longer(self, factor: float) -> "CameraPoints":
-        """The points if the focal length is this many times the stated one."""
-        scale = np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
-        return self.seen_by(replace(self.camera, intrinsics=self.camera.intrinsics * scale))
-
-    def later(self, delay_ns: int) -> "CameraPoints":
-        """The points if the images were taken earlier than stated, by a delay."""
-        return replace(self, times_ns=self.times_ns - delay_ns)
+    rays: Array  # (N, 3) unit directions, camera frame
+    times_ns: NDArray[np.int64]  # (G,) when the images were taken
 
 
-def misfits_px(points: CameraPoints, rows: Poses) -> Array:
-    """(N,) how far each point is from where the poses would move it at any depth in front of the camera; pixels."""
-    times, group = np.unique(points.times_ns, axis=0, return_inverse=True)
-    poses, _ = rows.at(times)
-    pose = np.broadcast_to(points.camera.ego_from_camera, (len(times), 4, 4))
-    geometry = GroupGeometry(pose, pose, inverse(poses[:, 1]) @ poses[:, 0], np.zeros(2))
-    focal = np.full(len(group), points.camera.intrinsics[0, 0])
-    residuals = EpipolarResiduals(group.reshape(-1), points.rays_a, points.rays_b, focal)
-    off = np.abs(residuals.of(geometry)[:, 0])
-    turned = np.einsum("nij,nj->ni", geometry.camera_b_from_camera_a[residuals.group, :3, :3], points.rays_a)
-    parallax = focal * np.linalg.norm(turned - points.rays_b, axis=-1)
-    behind = (residuals.depths(geometry).max(-1) < 0) & (parallax > PARALLAX_PX)
-    return np.where(behind, np.maximum(off, parallax), off)
+@dataclass(frozen=True)
+class Points:
+    """N points that two images of one camera, or two of different cameras, show; in G pairs of images."""
+
+    names: tuple[str, str]  # of the cameras, as stated
+    a: Side  # in the first images
+    b: Side  # in the second ones
+    group: Indices  # (N,) the pair of images
+
+    def geometry(self, rows: Poses) -> GroupGeometry:
+        """Of the G pairs of images."""
+        poses, _ = rows.at(np.stack([self.a.times_ns, self.b.times_ns]))
+        sides = (np.broadcast_to(side.camera.ego_from_camera, poses.shape[1:]) for side in (self.a, self.b))
+        return GroupGeometry(*sides, inverse(poses[1]) @ poses[0], np.zeros(2))
+
+    @property
+    def residuals(self) -> EpipolarResiduals:
+        """How far the points are from their epipolar lines."""
+        focal = np.full(len(self.group), self.a.camera.intrinsics[0, 0])
+        return EpipolarResiduals(self.group, self.a.rays, self.b.rays, focal)
+
+    def misfits_px(self, rows: Poses) -> Array:
+        """(N,) how far each point is from where the poses would move it at any depth in front of the camera."""
+        geometry, points = self.geometry(rows), self.residuals
+        off = np.abs(points.of(geometry)[:, 0])
+        turned = np.einsum("nij,nj->ni", geometry.camera_b_from_camera_a[self.group, :3, :3], points.rays_a)
+        parallax = points.focal * np.linalg.norm(turned - points.rays_b, axis=-1)
+        behind = (points.depths(geometry).max(-1) < 0) & (parallax > PARALLAX_PX)
+        return np.nan_to_num(np.where(behind, np.maximum(off, parallax), off), nan=FAR_PX)
+
+    def without(self, frame_ns: int, frames_ns: NDArray[np.int64]) -> "Points":
+        """Those of images that are not of a frame."""
+        times = np.stack([self.a.times_ns, self.b.times_ns], 1)
+        kept = (frames_ns[np.abs(times[..., None] - frames_ns).argmin(-1)] != frame_ns).all(1)[self.group]
+        a, b = (replace(side, rays=side.rays[kept]) for side in (self.a, self.b))
+        return replace(self, a=a, b=b, group=self.group[kept])
 
 
-def share(points: CameraPoints, rows: Poses) -> float:
-    """How well points fit the poses, 0 to 1: a point counts half that misfits by SCALE_PX."""
-    return float((1 / (1 + (misfits_px(points, rows) / SCALE_PX) ** 2)).mean())
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake of one camera or of two, with the texts of its finding."""
+
+    code: str
+    message: str
+    advice: str
+    cameras: Mapping[str, Camera]  # name of a camera that has it -> the camera that its images are of
+    gain: float = SMALL  # of the share of points that fit, at least
+    mirrored: bool = False
+    late_ns: int = 0
+    change: Array | None = None  # of the camera, see `_changed`
+
+    def undone(self, points: Points) -> Points:
+        """The points without the mistake."""
+        return replace(points, a=self._without(points.names[0], points.a), b=self._without(points.names[1], points.b))
+
+    def _without(self, name: str, side: Side) -> Side:
+        camera, rays = self.cameras.get(name), side.rays
+        if camera is None:
+            return side
+        if self.mirrored or camera.intrinsics is not side.camera.intrinsics:
+            pixels, _ = side.camera.project(rays)
+            rays = camera.rays(np.array([camera.width - 1, 0]) + pixels * (-1, 1) if self.mirrored else pixels)
+        return Side(camera, rays, side.times_ns - self.late_ns)
 
 
-def cost(points: CameraPoints, rows: Poses) -> float:
-    """How badly points fit the poses: Cauchy's cost, in units of SCALE_PX."""
-    return float(np.log1p((misfits_px(points, rows) / SCALE_PX) ** 2).sum())
+@dataclass(frozen=True)
+class Corrections:
+    """The unknowns of `Corrections.of`: a rotation vector and a shift of the vehicle at each frame, ego frame."""
+
+    stated: GroupGeometry
+    columns: Indices  # (G, 12) those of the frames of both images
+    deviations: Array  # (6 F,)
+
+    def geometry(self, local: Array) -> GroupGeometry:
+        """The geometry of all groups, `Parameters`."""
+        a, b = _motions(local[:, :6]), _motions(local[:, 6:])
+        return replace(self.stated, ego_b_from_ego_a=inverse(b) @ self.stated.ego_b_from_ego_a @ a)
 
 
-def points_of(views: Items[FrameView], rows: Poses) -> dict[str, CameraPoints]:
-    """The matched points of each camera that has enough of them, in the steps between views in which it moves."""
-    found: dict[str, list[CameraPoints]] = {}
-    for before, after in pairwise(views):
-        for index, camera in enumerate(before.cameras):
-            a, b = before.features[index], after.features[index]
-            times = np.array([view.timestamp_ns + round(view.late_s[index] * 1e9) for view in (before, after)])
-            first, second = rows.at(times)[0][:, :3, 3]
-            if a is not None and b is not None and np.linalg.norm(second - first) >= LEAST_M:
-                rays = matched(a, b, camera, camera)
-                each = CameraPoints(camera, *rays, np.broadcast_to(times, (len(rays[0]), 2)))
-                found.setdefault(camera.name, []).append(each)
-    joined = {name: _joined(each) for name, each in found.items()}
-    return {name: points for name, points in joined.items() if len(points.rays_a) >= FEWEST}
+def _motions(x: Array) -> Array:
+    matrices = np.broadcast_to(np.eye(4), (len(x), 4, 4)).copy()
+    matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_rotvec(x[:, :3]).as_matrix(), x[:, 3:]
+    return matrices
 
 
-def _joined(parts: Items[CameraPoints]) -> CameraPoints:
-    columns = ([getattr(part, name) for part in parts] for name in ("rays_a", "rays_b", "times_ns"))
-    return CameraPoints(parts[0].camera, *map(np.concatenate, columns))
+def corrected(
+    points: Items[Points], rows: Poses, frames_ns: NDArray[np.int64], start: Array | None = None
+) -> tuple[Poses, Array]:
+    """The poses, corrected a little at F frames so that the points fit; and the corrections (6 F,) in deviations.
+
+    start: corrections to begin with.
+    """
+    deviations = np.tile(DEVIATIONS, len(frames_ns))
+    x = np.zeros(len(deviations)) if start is None else start * deviations
+    if not points:
+        return rows, 0 * x
+    counts = np.cumsum([0, *(len(each.a.times_ns) for each in points)])
+    geometries, residuals = [each.geometry(rows) for each in points], [each.residuals for each in points]
+    group = np.concatenate([each.group + count for each, count in zip(points, counts, strict=False)])
+    together = EpipolarResiduals(group, *(_all(residuals, name) for name in ("rays_a", "rays_b", "focal")))
+    names = ("ego_from_camera_a", "ego_from_camera_b", "ego_b_from_ego_a")
+    times = np.concatenate([np.stack([each.a.times_ns, each.b.times_ns], 1) for each in points])
+    columns = (6 * np.abs(times[..., None] - frames_ns).argmin(-1)[..., None] + np.arange(6)).reshape(-1, 12)
+    unknowns = Corrections(GroupGeometry(*(_all(geometries, name) for name in names), np.zeros(2)), columns, deviations)
+    for scale in SCALES_PX if start is None else SCALES_PX[-1:]:
+        x = solve(unknowns, [(together, scale)], x).x
+    motions = _motions(np.stack([np.interp(rows.times_ns, frames_ns, column) for column in x.reshape(-1, 6).T], 1))
+    positions = rows.positions + np.einsum("tij,tj->ti", rows.rotations, motions[:, :3, 3])
+    return Poses(rows.times_ns, rows.rotations @ motions[:, :3, :3], positions), x / deviations
 
 
-def camera_findings(points: Mapping[str, CameraPoints], rows: Poses, rig: CameraRig) -> tuple[Finding, ...]:
+def _all(parts: Iterable[object], name: str) -> Array:
+    return np.concatenate([getattr(part, name) for part in parts])
+
+
+def misfits(points: Iterable[Points], rows: Poses) -> Array:
+    """(N,) squares of how far all points are from where the poses would move them, in units of SCALE_PX."""
+    return np.concatenate([np.zeros(0), *((each.misfits_px(rows) / SCALE_PX) ** 2 for each in points)])
+
+
+def share(squares: Array) -> float:
+    """How well points fit, of `misfits`, 0 to 1: a point counts half that misfits by SCALE_PX."""
+    return float((1 / (1 + squares)).mean())
+
+
+def cost(squares: Array) -> float:
+    """How badly points fit, of `misfits`: Cauchy's cost."""
+    return float(np.log1p(squares).sum())
+
+
+def points_of(views: Items[FrameView], rows: Poses) -> list[Points]:
+    """The matched points of each camera that has enough of them, in the steps between views in which it moves.
+
+    Then those of neighbours in one view, where both have enough.
+    """
+    times = [view.timestamp_ns + np.rint(view.late_s * 1e9).astype(np.int64) for view in views]
+    places, cameras = [rows.at(each)[0][:, :3, 3] for each in times], views[0].cameras
+    found: dict[tuple[int, int], list[tuple[Side, Side]]] = {}
+
+    def match(frames: tuple[int, int], pair: tuple[int, int]) -> None:
+        """Adds the points of two cameras, the first in one frame and the second in another."""
+        a, b = (views[frame].features[index] for frame, index in zip(frames, pair, strict=True))
+        if a is not None and b is not None:
+            rays = matched(a, b, cameras[pair[0]], cameras[pair[1]], at_once=frames[0] == frames[1])
+            sides = zip(rays, frames, pair, strict=True)
+            both = [Side(cameras[index], each, times[frame][[index]]) for each, frame, index in sides]
+            found.setdefault(pair, []).append((both[0], both[1]))
+
+    for frames in ((a, a + step) for step in STEPS for a in range(len(views) - step)):
+        ways = np.linalg.norm(places[frames[1]] - places[frames[0]], axis=1)
+        for index in np.flatnonzero(ways >= LEAST_M).tolist():
+            match(frames, (index, index))
+    moving = {pair[0] for pair, parts in found.items() if sum(len(a.rays) for a, _ in parts) >= FEWEST}
+    for pair in (pair for pair in neighbours(cameras) if pair[0] < pair[1] and moving.issuperset(pair)):
+        for frame in range(len(views)):
+            match((frame, frame), pair)
+    return [_joined(parts) for pair, parts in found.items() if moving.issuperset(pair)]
+
+
+def _joined(parts: Items[tuple[Side, Side]]) -> Points:
+    """The points of pairs of images as one, at most MOST of them."""
+    counts = [len(a.rays) for a, _ in parts]
+    kept = np.arange(sum(counts))[:: max(1, -(-sum(counts) // MOST))]
+    a, b = (Side(of[0].camera, _all(of, "rays")[kept], _all(of, "times_ns")) for of in zip(*parts, strict=True))
+    return Points((a.camera.name, b.camera.name), a, b, np.repeat(np.arange(len(parts)), counts)[kept])
+
+
+def camera_findings(
+    points: Items[Points], rows: Poses, views: Items[FrameView], interval_ns: int
+) -> tuple[Finding, ...]:
     """One finding of each camera whose points do not fit the poses, and fit where a mistake is undone; or of the poses.
 
-    points: of `points_of`. rig: all cameras, also those without points.
+    points: of `points_of`. interval_ns: between two frames of the drive, by which images may be late.
     """
-    stated = {name: share(each, rows) for name, each in points.items()}
+    own = [each for each in points if each.names[0] == each.names[1]]
     flipped = replace(rows, rotations=FLIP @ rows.rotations @ FLIP, positions=rows.positions @ FLIP)
-    before, undone = (_middle([share(each, of) for each in points.values()]) for of in (rows, flipped))
-    if len(points) > 1 and undone - before >= SURELY:  # of one camera, the images may be mirrored
+    shares = ([share(misfits([each], of)) for each in own] for of in (rows, flipped))
+    before, undone = (sorted(each or [1.0])[len(own) // 2] for each in shares)
+    if len(own) > 1 and undone - before >= SURELY:  # of one camera, the images may be mirrored
         found = f"the points of the middle camera fit by {before:.2f} of 1 as stated, {undone:.2f} with y mirrored"
         advice = "mirror y of positions and rotations, or turn z up"
         message = "the poses are left-handed, or their z points down"
         return (Finding("motion-axes", "error", None, message, found, "x forward, y left, z up", advice),)
-    findings, left = list[Finding](), dict(points)
-    for gained, first, second in sorted(_exchanges(points, rows, stated, rig), reverse=True):
-        if first in left and (second in left or second not in points):
-            message, advice = f"its images are those of {second}, and the other way round", "exchange them"
-            findings.append(_finding("images-exchanged", first, message, stated[first], gained, advice))
-            left = {name: each for name, each in left.items() if name not in (first, second)}
-    usual = _middle([stated[name] for name in left])
-    only_coarse = usual < USUAL_SHARE or bool(findings)  # a camera that is off a little can wait for the exchanged ones
-    if usual < USUAL_SHARE:
-        message = "focal lengths and rotations of single cameras were not checked"
-        found = f"the points of the middle camera fit the motion of the vehicle by {usual:.2f} of 1"
-        findings.append(Finding("cameras-unchecked", "info", None, message, found, f"{USUAL_SHARE} or more"))
-    for name, each in left.items():
-        before = cost(each, rows)
-        tried = _undone(each, rows, _interval_ns(points), only_coarse=only_coarse)
-        told = [one for one in tried if one.is_told(rows, stated[name], before)]
-        if told:
-            likeliest = min(told, key=lambda one: cost(one.points, rows))
-            undone = share(likeliest.points, rows)
-            findings.append(_finding(likeliest.code, name, likeliest.message, stated[name], undone, likeliest.advice))
+    frames_ns = np.array([view.timestamp_ns for view in views])
+    findings, left = list[Finding](), [each.names[0] for each in own]
+    while left:
+        told = sorted(_told(points, rows, frames_ns, views[0].cameras, left, interval_ns), key=lambda one: -one[0])
+        if not told:
+            break
+        gained, mistake, found = told[0]
+        camera, kind = next(iter(mistake.cameras)), (mistake.code, mistake.cameras.keys())
+        alike = [one for gain, one, _ in told if gain >= ALIKE * gained and (one.code, one.cameras.keys()) == kind]
+        alike = alike[: 1 if mistake.change is None else None]
+        message = ", or ".join(each.message for each in alike)
+        findings.append(Finding(mistake.code, "error", camera, message, found, "", mistake.advice))
+        points = [mistake.undone(each) for each in points]
+        left = [name for name in left if name not in mistake.cameras]
     return tuple(findings)
 
 
-def _middle(shares: list[float]) -> float:
-    return sorted(shares or [1.0])[len(shares) // 2]
+def _told(
+    points: Items[Points],
+    rows: Poses,
+    frames_ns: NDArray[np.int64],
+    cameras: Items[Camera],
+    names: Items[str],
+    interval_ns: int,
+) -> Iterator[tuple[float, Mistake, str]]:
+    """Mistakes of the named cameras after whose undoing the points fit surely better: the cost gained, and in words."""
+    fitting, x = corrected(points, rows, frames_ns)
+    whole = cost(misfits(points, fitting)) + float(x @ x)
+    for camera in (camera for camera in cameras if camera.name in names):
+        others, start = corrected([each for each in points if camera.name not in each.names], rows, frames_ns)
+        for mistake in _mistakes(camera, points, others, cameras, interval_ns):
+            mine = [each for each in points if not mistake.cameras.keys().isdisjoint(each.names)]
+            undone = [mistake.undone(each) for each in mine]
+            # A second camera with the same mistake makes the corrections worse than none.
+            tried = [(misfits(undone, fitting), misfits(mine, fitting)) for fitting in (others, rows)]
+            sides = max(tried[: 1 if mistake.change is not None else 2], key=lambda each: share(each[0]))
+            (after, before), (left, stated) = map(share, sides), map(cost, sides)
+            fits = after - before >= (mistake.gain if after >= LEAST_SHARE else SURELY)
+            if not fits or stated - left < COST_SHARE * stated:
+                continue
+            if mistake.change is not None and not _is_certain(camera, mistake.change, mine, others, frames_ns):
+                continue
+            changed = [mistake.undone(each) for each in points]
+            fitting, x = corrected(changed, rows, frames_ns, None if mistake.change is None else start)
+            gained = whole - cost(misfits(changed, fitting)) - float(x @ x)
+            if gained >= COST_GAIN:
+                found = f"its points fit the motion of the vehicle by {before:.2f} of 1 as stated, {after:.2f} where "
+                yield gained, mistake, found + "this is undone"
 
 
-def _finding(code: str, camera: str, message: str, stated: float, undone: float, advice: str) -> Finding:
-    found = f"{stated:.2f} of 1 as stated, {undone:.2f} where this is undone"
-    return Finding(code, "error", camera, message, f"its points fit the motion of the vehicle by {found}", "", advice)
+def _is_certain(
+    camera: Camera, change: Array, points: Items[Points], rows: Poses, frames_ns: NDArray[np.int64]
+) -> bool:
+    """Whether a change of a camera is much larger than the spread of those that its points show without one frame."""
+    few = ([each.without(frame, frames_ns) for each in points] for frame in frames_ns.tolist())
+    spread = np.std([_best(camera, each, rows, len(change)) for each in few], axis=0) * np.sqrt(len(frames_ns) - 1)
+    least = np.maximum(student_t.ppf(CERTAIN, len(frames_ns) - 1) * spread, LEAST[len(change)])
+    return bool((np.abs(change) >= least).any())
 
 
-def _exchanges(
-    points: Mapping[str, CameraPoints], rows: Poses, stated: Mapping[str, float], rig: CameraRig
-) -> Iterator[tuple[float, str, str]]:
-    """The pairs of cameras whose points fit if their images are exchanged: the share of those that fit, and names."""
-    reduced_size = {name: (each.camera.width, each.camera.height) for name, each in points.items()}
-    for first, other in ((points[name], camera) for name in points for camera in rig.cameras if camera.name != name):
-        name, size = first.camera.name, reduced_size[first.camera.name]
-        if other.name in points and (other.name < name or reduced_size[other.name] != size):
-            continue
-        there = (
-            points[other.name].camera
-            if other.name in points
-            else other.scaled(size[0] / other.width, size[1] / other.height)
-        )
-        gained = [(share(first.seen_by(there), rows), stated[name])]
-        if other.name in points:
-            gained.append((share(points[other.name].seen_by(first.camera), rows), stated[other.name]))
-        gains = [undone - before for undone, before in gained]
-        fits = len(gained) == 2 or gained[0][0] >= LEAST_SHARE  # two that fit each other's camera need not fit well
-        if fits and min(gains) >= GAIN / 2 and np.mean(gains) >= EXCHANGED:
-            yield float(np.mean([undone for undone, _ in gained])), name, other.name
-
-
-@dataclass(frozen=True)
-class _Undone:
-    """The points of a camera after a mistake is undone, with the texts of its finding."""
-
-    points: CameraPoints
-    code: str
-    message: str
-    advice: str
-
-    gain: float  # of the share of points that fit, at least
-
-    def is_told(self, rows: Poses, share_before: float, cost_before: float) -> bool:
-        """Whether the points fit now, and surely better than before."""
-        gain, after = cost_before - cost(self.points, rows), share(self.points, rows)
-        enough = after >= LEAST_SHARE and after - share_before >= self.gain
-        return enough and gain >= max(COST_GAIN, COST_SHARE * cost_before)
-
-
-def _undone(points: CameraPoints, rows: Poses, interval_ns: int, *, only_coarse: bool) -> Iterator[_Undone]:
-    """The mistakes that one camera may have, undone. only_coarse: mirrored and late images alone."""
-    yield _Undone(points.mirrored(), "images-mirrored", "its images are mirrored", "mirror them", GAIN)
+def _mistakes(
+    camera: Camera, points: Items[Points], rows: Poses, cameras: Items[Camera], interval_ns: int
+) -> Iterator[Mistake]:
+    """The mistakes that a camera may have. rows: as the other cameras show them."""
+    name, mine = camera.name, [each for each in points if camera.name in each.names]
+    for other in cameras:
+        if other.name != name and (other.width, other.height) == (camera.width, camera.height):
+            message = f"its images are those of {other.name}, and the other way round"
+            yield Mistake("images-exchanged", message, "exchange them", {name: other, other.name: camera}, COARSE)
+    yield Mistake("images-mirrored", "its images are mirrored", "mirror them", {name: camera}, COARSE, mirrored=True)
     for late_ns in (interval_ns, -interval_ns):
-        message, gain = f"its images are {abs(late_ns) / 1e6:.0f} ms too ", SURELY if only_coarse else GAIN
-        message += "late" if late_ns > 0 else "early"
-        yield _Undone(points.later(late_ns), "images-late", message, "correct their times or their order", gain)
-    if only_coarse:
-        return
-    factor = best_focal(points, rows)
-    if LEAST_LONGER <= abs(np.log(factor)) < LENGTHS[-1]:  # the longest and shortest one tried are no measurement
-        message = f"the stated focal length is {1 / factor:.2f} times the one that the images show"
-        yield _Undone(points.longer(factor), "focal-length", message, "calibrate the lens, or correct its scale", SMALL)
-    turn = best_turn(points, rows)
-    up, right, roll = np.degrees(turn)
-    if LEAST_TURN_DEG <= np.linalg.norm((up, right, roll)) <= MOST_TURN_DEG:
-        message = f"it looks {abs(right):.1f}° further {'right' if right > 0 else 'left'} and {abs(up):.1f}° further "
-        message += f"{'up' if up > 0 else 'down'} than stated, rolled by {roll:+.1f}°"
-        yield _Undone(points.turned(turn), "rotation-off", message, "measure it with `bevcli calibrate`", SMALL)
+        message = f"its images are {abs(late_ns) / 1e6:.0f} ms too {'late' if late_ns > 0 else 'early'}"
+        advice = "correct their times or their order"
+        yield Mistake("images-late", message, advice, {name: camera}, COARSE, late_ns=late_ns)
+    for count in LEAST:
+        change = _best(camera, mine, rows, count)
+        if np.linalg.norm(change) >= LEAST[count]:
+            message, advice = _in_words(change), "measure it with `bevcli calibrate`, or calibrate the lens"
+            yield Mistake("calibration-off", message, advice, {name: _changed(camera, change)}, change=change)
 
 
-def _interval_ns(points: Mapping[str, CameraPoints]) -> int:
-    return int(np.median(np.concatenate([np.ptp(each.times_ns, axis=1) for each in points.values()])))
+def _in_words(change: Array) -> str:
+    if len(change) == 1:
+        return f"the stated focal length is {np.exp(-change[0]):.2f} times the one that the images show"
+    up, right, roll = np.degrees(change)
+    sides = f"{abs(right):.1f}° further {'right' if right > 0 else 'left'} and {abs(up):.1f}° further "
+    return f"it looks {sides}{'up' if up > 0 else 'down'} than stated, rolled by {roll:+.1f}°"
 
 
-def best_focal(points: CameraPoints, rows: Poses) -> float:
-    """How many times the stated focal length the one is with which the points fit best."""
-    best = 1.0
-    for lengths in (LENGTHS, LENGTHS / 9):
-        factors = best * np.exp(lengths)
-        best = float(factors[int(np.argmax([share(points.longer(factor), rows) for factor in factors]))])
-    return best
+def _changed(camera: Camera, by: Array) -> Camera:
+    """The camera, turned by a rotation vector (3,), or with the focal length times the exponential of (1,)."""
+    if len(by) == 1:
+        scale = np.exp(by[0])
+        return replace(camera, intrinsics=camera.intrinsics * [[scale, 1, 1], [1, scale, 1], [1, 1, 1]])
+    pose = camera.ego_from_camera.copy()
+    pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec(by).as_matrix()
+    return replace(camera, ego_from_camera=pose)
 
 
-def best_turn(points: CameraPoints, rows: Poses) -> Array:
-    """(3,) the rotation vector of the camera, about its right, down and forward axes, after which the points fit."""
+def _best(camera: Camera, points: Items[Points], rows: Poses, count: int) -> Array:
+    """(count,) the change of a camera after which its points fit best, see `_changed`."""
 
-    def residuals(turn: Array) -> Array:
-        off = misfits_px(points.turned(turn), rows) / SCALE_PX
-        return np.append(np.sqrt(np.log1p(off**2)), turn / TURN)
+    def residuals(by: Array, scale: float) -> Array:
+        undone = Mistake("", "", "", {camera.name: _changed(camera, by)}).undone
+        return np.append(np.sqrt(np.log1p(misfits(map(undone, points), rows) / scale**2)), by / USUAL[count])
 
-    return np.asarray(least_squares(residuals, np.zeros(3), diff_step=1e-4, x_scale=0.01).x)
+    change = np.zeros(count)
+    for scale in (ROUGH, 1.0):
+        change = least_squares(residuals, change, diff_step=1e-4, x_scale=0.01, args=(scale,)).x
+    return change
