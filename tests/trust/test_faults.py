@@ -142,7 +142,7 @@ def test_dead_and_frozen_cameras_are_named():
 
 
 def test_few_cameras_that_are_off_do_not_make_poses_wrong():
-    poses, camera = (Finding(code, "error", None, code) for code in ("motion-wrong-drive", "rotation-off"))
+    poses, camera = (Finding(code, "error", None, code) for code in ("motion-wrong-drive", "calibration-off"))
     info = replace(poses, severity="info")
     assert one_cause((poses,), (camera,), 6) == (camera,)
     assert one_cause((poses,), (camera,) * 3, 6) == (poses,)

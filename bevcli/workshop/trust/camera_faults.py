@@ -8,6 +8,7 @@ successive images of a camera, and between images that two neighbours took at on
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence as Items
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,8 +65,8 @@ class Points:
     def geometry(self, rows: Poses) -> GroupGeometry:
         """Of the G pairs of images."""
         poses, _ = rows.at(np.stack([self.a.times_ns, self.b.times_ns]))
-        sides = (np.broadcast_to(side.camera.ego_from_camera, poses.shape[1:]) for side in (self.a, self.b))
-        return GroupGeometry(*sides, inverse(poses[1]) @ poses[0], np.zeros(2))
+        a, b = (np.broadcast_to(side.camera.ego_from_camera, poses.shape[1:]) for side in (self.a, self.b))
+        return GroupGeometry(a, b, inverse(poses[1]) @ poses[0], np.zeros(2))
 
     @property
     def residuals(self) -> EpipolarResiduals:
@@ -153,9 +154,10 @@ def corrected(
     group = np.concatenate([each.group + count for each, count in zip(points, counts, strict=False)])
     together = EpipolarResiduals(group, *(_all(residuals, name) for name in ("rays_a", "rays_b", "focal")))
     names = ("ego_from_camera_a", "ego_from_camera_b", "ego_b_from_ego_a")
+    a, b, motion = (_all(geometries, name) for name in names)
     times = np.concatenate([np.stack([each.a.times_ns, each.b.times_ns], 1) for each in points])
     columns = (6 * np.abs(times[..., None] - frames_ns).argmin(-1)[..., None] + np.arange(6)).reshape(-1, 12)
-    unknowns = Corrections(GroupGeometry(*(_all(geometries, name) for name in names), np.zeros(2)), columns, deviations)
+    unknowns = Corrections(GroupGeometry(a, b, motion, np.zeros(2)), columns, deviations)
     for scale in SCALES_PX if start is None else SCALES_PX[-1:]:
         x = solve(unknowns, [(together, scale)], x).x
     motions = _motions(np.stack([np.interp(rows.times_ns, frames_ns, column) for column in x.reshape(-1, 6).T], 1))
@@ -163,7 +165,7 @@ def corrected(
     return Poses(rows.times_ns, rows.rotations @ motions[:, :3, :3], positions), x / deviations
 
 
-def _all(parts: Iterable[object], name: str) -> Array:
+def _all(parts: Iterable[object], name: str) -> NDArray[Any]:
     return np.concatenate([getattr(part, name) for part in parts])
 
 
