@@ -3,7 +3,9 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.readings.stated_drive import Convention, choices_of, opened, write, wrong
 
 from bevcli.errors import InputError
@@ -73,3 +75,37 @@ def test_what_is_stated_is_believed_and_a_note_says_what_fits(street, tmp_path):
         r"does not fit the images \(residual .* they fit `--pose-transform world_from_body", found.notes[-1]
     )
     assert "does not fit" not in " ".join(opened(tmp_path, options, **stated | {"pose_transform": None}).notes)
+
+
+def late(rows):
+    return np.column_stack([rows[:, 0] + 0.1, rows[:, 1:]])
+
+
+def of_a_mast(rows):
+    """Of a point ahead of the vehicle's origin and above it."""
+    return np.column_stack(
+        [rows[:, 0], rows[:, 1:4] + Rotation.from_quat(rows[:, 4:]).apply([1.4, 0.3, 0.8]), rows[:, 4:]]
+    )
+
+
+def without_scale(rows):
+    return np.column_stack([rows[:, 0], 0.37 * rows[:, 1:4], rows[:, 4:]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "stated", "told"),
+    [
+        (late, {}, "if the poses are 100 ms earlier"),
+        (of_a_mast, {}, r"of a point 1\.\d m ahead"),
+        (without_scale, {"rig_unit": "m"}, r"0\.3\d of the ways"),
+    ],
+)
+def test_poses_that_would_fit_much_better_otherwise_are_refused(change, stated, told, tmp_path):
+    drive = open_sequence(STREET, every=2, frames=slice(0, 8), ground_truth=False)
+    options = write(drive, tmp_path, Convention())
+    poses = options["ego_motion_file"]
+    np.savetxt(poses, change(np.loadtxt(poses)), fmt="%.9f")
+    with pytest.raises(InputError, match=told):
+        opened(tmp_path, options, **stated)
+    opened(tmp_path, options, image_check=False, pose_axes="flu", pose_transform="world_from_body", rig_unit="m")

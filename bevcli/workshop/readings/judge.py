@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import Finding, InputError
@@ -34,6 +35,10 @@ UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the on
 LOWEST_M = -0.2  # mean height of usual cameras above the origin, which may be at a roof
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
+LEAST_OFF_PX, OFF = 0.4, 2.2  # residual of poses that may be late or of another point; how much smaller it is without
+LATE_NS = (50_000_000, 100_000_000, 200_000_000, 400_000_000)
+TRIED_POINTS = 80  # of the vehicle, that the poses may be of
+OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those of a rig that is certain
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
@@ -234,6 +239,11 @@ class Judged:
                 f"{best.residual_px:.1f} px): correct the file, pass `odometry=True` (`--odometry`) in place of the "
                 "poses, or `image_check=False` (`--no-image-check`) to read it so"
             )
+        if wrong := self._misstated(left[0], is_stated):
+            raise InputError(
+                f"{self._files(BOTH)}: {wrong}; correct the poses, pass `odometry=True` (`--odometry`) in place of "
+                "them, or `image_check=False` (`--no-image-check`) to read them so"
+            )
         others = [each for each in found if not each.is_like(left[0])]
         if not others or not np.isfinite(best.residual_px):
             return left[0], ""
@@ -267,6 +277,56 @@ class Judged:
         return (
             f"what is stated does not fit the images (residual {residual_px}): they fit `{flags}` "
             f"({fitting.residual_px:.1f} px)"
+        )
+
+    def _misstated(self, chosen: Candidate, is_stated: bool) -> str:
+        """Why poses of another program are not believed as they are read: how they would fit much better; "" if so.
+
+        is_stated: the user says what they are, but for their scale.
+        """
+        points = self._points
+        if chosen.poses is None or points is None or len(self._pairs) < FEWEST_PAIRS:
+            return ""
+        has_scale = self._options.pose_unit is not None
+        seen = None if has_scale else height_above_road(points, chosen.cameras, chosen.steps)
+        if seen is not None and seen.clearness >= CLEAR_HEIGHT:
+            scale = seen.height_m / max(self._options.height or float(np.mean(chosen.cameras[:, 2, 3])), 0.1)
+            is_high = scale > OTHER_SCALE and (chosen.rig is None or self._options.height is not None)
+            if is_high or scale < 1 / OTHER_SCALE:  # the origin of an open rig may be above the road, not below
+                return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
+        if is_stated or chosen.residual_px <= LEAST_OFF_PX:
+            return ""
+        track = _tracks(self._poses, self._times)[self._poses.readings.index(chosen.poses)]
+        at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64)
+        rig = {camera.name: camera.ego_from_camera for camera in self._drive.rig.cameras}
+        if chosen.rig is not None:
+            rig = dict(chosen.rig.ego_from_camera)
+        body = rig[chosen.poses.camera] if chosen.poses.camera else np.eye(4)
+
+        def residual_px(place: Array, late_ns: int) -> float:
+            steps = place @ body_motions(track.at(at - late_ns)[0]) @ inverse(place)
+            return points.residual_px(chosen.cameras, steps)
+
+        def moved_px(place: Array) -> float:
+            return residual_px(rigid(place, body[:3, :3]), 0)
+
+        changes = [
+            (residual_px(body, sign * late_ns), f"{late_ns // 10**6} ms {word}")
+            for late_ns, (sign, word) in product(LATE_NS, ((1, "later"), (-1, "earlier")))
+        ]
+        start = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+        limits = {"initial_simplex": start, "maxfev": TRIED_POINTS}
+        best = minimize(
+            lambda x: residual_px(rigid(x, body[:3, :3]), 0), start[0], method="Nelder-Mead", options=limits
+        )
+        x, y, z = best.x
+        changes.append((best.fun, f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"))
+        without, text = min(changes)
+        if chosen.residual_px <= OFF * without:
+            return ""
+        return (
+            f"{chosen.poses.words()} fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if "
+            f"the poses are {text}"
         )
 
     def _on_both_sides(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> tuple[Candidate, str]:
