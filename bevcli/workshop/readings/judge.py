@@ -25,19 +25,20 @@ from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.readings.heights import height_above_road
 from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
-from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
+from bevcli.workshop.readings.residuals import MatchedPoints, body_motions, share_that_moves_as_one
 
 SOUND_PX = (2.5, 1.0, 0.7)  # largest residual of a reading that is believed, reduced pixels, by its rank
 CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger
 NEAR, NEAR_PX = 1.25, 0.05  # the same, of readings of which the usual one is believed
 FLOOR_PX = 0.3  # no other reading is clearly better than one with this
 UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the only one
+MATCHED = 0.5  # share of matched points, that one motion explains; with fewer the images show nothing
 LOWEST_M = -0.2  # mean height of usual cameras above the origin, which may be at a roof
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
 LEAST_OFF_PX, OFF = 0.4, 2.2  # residual of poses that may be late or of another point; how much smaller it is without
 LATE_NS = (50_000_000, 100_000_000, 200_000_000, 400_000_000)
-TRIED_POINTS = 80  # of the vehicle, that the poses may be of
+TRIED_POINTS, FARTHEST_POINT_M = 80, 4.0  # of the vehicle, that the poses may be of
 OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those of a rig that is certain
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
@@ -232,7 +233,7 @@ class Judged:
             unsound
             and len(self._pairs) >= FEWEST_PAIRS
             and not is_stated
-            and (best.rank or best.residual_px > UNFIT_PX)
+            and (best.rank or (best.residual_px > UNFIT_PX and self._images_are_clear()))
         ):
             raise InputError(
                 f"{self._files(BOTH)}: the images do not fit the only reading, {best.whole.words()} (residual "
@@ -250,6 +251,10 @@ class Judged:
         names = differing([left[0].whole, others[0].whole])
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
+
+    def _images_are_clear(self) -> bool:
+        """False where most points are matched wrongly, as at night."""
+        return float(np.median([share_that_moves_as_one(pair) for pair in self._pairs])) >= MATCHED
 
     def fitting(self, chosen: Candidate | None) -> tuple[Candidate, str] | None:
         """The reading that fits the images where what is stated does not, and the residual of that, in words.
@@ -320,9 +325,12 @@ class Judged:
             lambda x: residual_px(rigid(x, body[:3, :3]), 0), start[0], method="Nelder-Mead", options=limits
         )
         x, y, z = best.x
-        changes.append((best.fun, f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"))
+        if np.linalg.norm(best.x) < FARTHEST_POINT_M:
+            changes.append(
+                (best.fun, f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin")
+            )
         without, text = min(changes)
-        if chosen.residual_px <= OFF * without:
+        if chosen.residual_px <= OFF * without or without > LEAST_OFF_PX:
             return ""
         return (
             f"{chosen.poses.words()} fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if "
