@@ -1,6 +1,6 @@
 """The reading of a rig and of poses that the images show, or the question to the user."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -295,8 +295,11 @@ class Judged:
         has_scale = self._options.pose_unit is not None
         seen = None if has_scale else height_above_road(points, chosen.cameras, chosen.steps)
         if seen is not None and seen.clearness >= CLEAR_HEIGHT:
-            scale = seen.height_m / max(self._options.height or float(np.mean(chosen.cameras[:, 2, 3])), 0.1)
-            is_high = scale > OTHER_SCALE and (chosen.rig is None or self._options.height is not None)
+            height = self._options.height
+            if isinstance(height, Mapping):
+                height = float(np.mean([*height.values()]))
+            scale = seen.height_m / max(height or float(np.mean(chosen.cameras[:, 2, 3])), 0.1)
+            is_high = scale > OTHER_SCALE and (chosen.rig is None or height is not None)
             if is_high or scale < 1 / OTHER_SCALE:  # the origin of an open rig may be above the road, not below
                 return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
         if is_stated or chosen.residual_px <= LEAST_OFF_PX:
