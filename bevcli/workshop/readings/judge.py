@@ -25,14 +25,13 @@ from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.readings.heights import height_above_road
 from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
-from bevcli.workshop.readings.residuals import MatchedPoints, body_motions, share_that_moves_as_one
+from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
 
 SOUND_PX = (2.5, 1.0, 0.7)  # largest residual of a reading that is believed, reduced pixels, by its rank
 CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger
 NEAR, NEAR_PX = 1.25, 0.05  # the same, of readings of which the usual one is believed
 FLOOR_PX = 0.3  # no other reading is clearly better than one with this
 UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the only one
-MATCHED = 0.5  # share of matched points, that one motion explains; with fewer the images show nothing
 LOWEST_M = -0.2  # mean height of usual cameras above the origin, which may be at a roof
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
@@ -43,7 +42,7 @@ OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
-FEWEST_PAIRS = 2  # of images, that decide
+FEWEST_PAIRS, SURE_PAIRS = 2, 4  # of images, that decide; that refuse the only reading
 MOST_RANK = 4  # of a rig and poses
 AROUND_NS = 10**9  # before and after the frames, as images may be a little off their times
 CHORD_NS, CHORDS = 500_000_000, 60  # of short steps, by which readings are compared
@@ -233,7 +232,7 @@ class Judged:
             unsound
             and len(self._pairs) >= FEWEST_PAIRS
             and not is_stated
-            and (best.rank or (best.residual_px > UNFIT_PX and self._images_are_clear()))
+            and (best.rank or (best.residual_px > UNFIT_PX and len(self._pairs) >= SURE_PAIRS))
         ):
             raise InputError(
                 f"{self._files(BOTH)}: the images do not fit the only reading, {best.whole.words()} (residual "
@@ -251,10 +250,6 @@ class Judged:
         names = differing([left[0].whole, others[0].whole])
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
-
-    def _images_are_clear(self) -> bool:
-        """False where most points are matched wrongly, as at night."""
-        return float(np.median([share_that_moves_as_one(pair) for pair in self._pairs])) >= MATCHED
 
     def fitting(self, chosen: Candidate | None) -> tuple[Candidate, str] | None:
         """The reading that fits the images where what is stated does not, and the residual of that, in words.

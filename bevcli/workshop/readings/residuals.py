@@ -70,15 +70,6 @@ def rotation_seen(pair: CameraPair) -> Array:
     return np.asarray(rotation, dtype=np.float64)
 
 
-def share_that_moves_as_one(pair: CameraPair) -> float:
-    """The share of the matched points, 0 to 1, that any one motion of the camera explains; of noise it is small."""
-    flat_a, flat_b = (rays[:, :2] / rays[:, 2:] for rays in (pair.rays_a, pair.rays_b))
-    _, inliers = cv2.findEssentialMat(
-        flat_a, flat_b, np.eye(3), cv2.RANSAC, 0.999, PARALLAX_PX / pair.camera.intrinsics[0, 0]
-    )
-    return 0.0 if inliers is None else float(inliers.mean())
-
-
 def body_motions(poses: Array) -> Array:
     """(P, 4, 4) body_b_from_body_a of poses (P, 2, 4, 4), world_from_body at the times of both images."""
     return inverse(poses[:, 1]) @ poses[:, 0]
