@@ -271,6 +271,7 @@ def test_times_with_two_readings_are_asked_for(tmp_path):
         (lines(S, *LEVEL, separator=",", header="t,x,y"), "columns of the orientation are missing"),
         (lines(X[1:], Y[1:], YAW[1:], separator=",", header="x,y,yaw"), "a column of times is missing"),
         ('{"poses": [{"t": 1, "x": 2', "broken JSON"),
+        ("[" * 100_000, "nested too deeply"),
         ('[{"t": 1, "x": 0, "y": 0}, {"t": 2, "x": 0}]', "pose 1 has other fields than the first one"),
         (lines(S, X, Y, YAW, YAW, separator=",", header="t,x,y,yaw,heading"), "yaw and one of heading"),
         (lines(S, X, X, Y, YAW, separator=",", header="t,x,px,y,yaw"), 'columns "x" and "px" are both x'),

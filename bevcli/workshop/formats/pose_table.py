@@ -3,7 +3,6 @@
 GPX, KML, NMEA, GoPro's and what `ros2 topic echo --csv` prints are made such tables.
 """
 
-import json
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,9 +16,8 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
-from bevcli.parsing.documents import CSV_BYTES, CsvRow, parse_numbers_at_once
+from bevcli.parsing.documents import CSV_BYTES, CsvRow, parse_json, parse_numbers_at_once
 from bevcli.parsing.files import read_bytes, read_text
-from bevcli.printing import reason_of
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.workshop.formats.markup import parse_xml
 
@@ -288,13 +286,10 @@ def table_text(path: Path) -> str:
 
 def _of_objects(path: Path, text: str) -> Iterator[str]:
     """The poses of a JSON file: a list of objects, alone or in an object, or one object a line."""
-    try:
-        entries = json.loads(text)
-    except ValueError:
-        try:
-            entries = [json.loads(line) for line in text.splitlines() if line.strip()]
-        except ValueError as error:
-            raise InputError(f"{path}: broken JSON ({reason_of(error)[:200]})") from None
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if len(lines) > 1 and all(line.startswith("{") and line.endswith("}") for line in lines):
+        text = "[" + ",\n".join(lines) + "]"
+    entries = parse_json(text.encode(), path)
     if isinstance(entries, dict):
         entries = next((each for each in entries.values() if isinstance(each, list)), [])
     rows = [dict(_flat("", entry)) for entry in entries if isinstance(entry, dict)]

@@ -185,8 +185,7 @@ class Judged:
         for rig, (index, reading) in product(rigs, enumerate(readings)):
             if sum(each.rank for each in (rig, reading) if each) != rank:
                 continue
-            stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
-            where = stated if rig is None else rig.ego_from_camera
+            where = self._cameras(rig)
             cameras = np.array([where[pair.camera.name] for pair in self._pairs]).reshape(-1, 4, 4)
             body = where[reading.camera] if reading is not None and reading.camera else np.eye(4)
             steps, way = (body @ each @ inverse(body) for each in motions.get(index, (nothing, nothing)))
@@ -196,6 +195,11 @@ class Judged:
                 steps = self._points.motions_seen(cameras)
             residual = np.inf if self._points is None else self._points.residual_px(cameras, steps)
             yield Candidate(rig, reading, cameras, steps, way, residual)
+
+    def _cameras(self, rig: RigReading | None) -> Mapping[str, Array]:
+        """ego_from_camera (4, 4) of each camera."""
+        stated = {each.name: each.ego_from_camera for each in self._drive.rig.cameras}
+        return stated if rig is None else rig.ego_from_camera
 
     def _short_steps(self) -> NDArray[np.int64]:
         """(S, 2) times of short steps all over the drive; none without poses."""
@@ -284,56 +288,54 @@ class Judged:
 
         is_stated: the user says what they are, but for their scale.
         """
-        points = self._points
-        if chosen.poses is None or points is None or len(self._pairs) < FEWEST_PAIRS:
+        if chosen.poses is None or len(self._pairs) < FEWEST_PAIRS:
             return ""
-        has_scale = self._options.pose_unit is not None
-        seen = None if has_scale else height_above_road(points, chosen.cameras, chosen.steps)
-        if seen is not None and seen.clearness >= CLEAR_HEIGHT:
-            height = self._options.height
-            if isinstance(height, Mapping):
-                height = float(np.mean([*height.values()]))
-            scale = seen.height_m / max(height or float(np.mean(chosen.cameras[:, 2, 3])), 0.1)
-            is_high = scale > OTHER_SCALE and (chosen.rig is None or height is not None)
-            if is_high or scale < 1 / OTHER_SCALE:  # the origin of an open rig may be above the road, not below
-                return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
-        if is_stated or chosen.residual_px <= LEAST_OFF_PX:
-            return ""
-        track = _tracks(self._poses, self._times)[self._poses.readings.index(chosen.poses)]
-        at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64)
-        rig = {camera.name: camera.ego_from_camera for camera in self._drive.rig.cameras}
-        if chosen.rig is not None:
-            rig = dict(chosen.rig.ego_from_camera)
-        body = rig[chosen.poses.camera] if chosen.poses.camera else np.eye(4)
+        if text := self._other_scale(chosen):
+            return text
+        return "" if is_stated or chosen.residual_px <= LEAST_OFF_PX else self._late_or_elsewhere(chosen, chosen.poses)
 
-        def residual_px(place: Array, late_ns: int) -> float:
+    def _other_scale(self, chosen: Candidate) -> str:
+        """The share of the ways that the poses state, by the height of the cameras above the road; "" if it is all."""
+        seen_m = self._height_seen(chosen) if self._options.pose_unit is None else None
+        if seen_m is None:
+            return ""
+        height = self._options.height
+        if isinstance(height, Mapping):
+            height = float(np.mean([*height.values()]))
+        scale = seen_m / max(height or float(np.mean(chosen.cameras[:, 2, 3])), 0.1)
+        is_high = scale > OTHER_SCALE and (chosen.rig is None or height is not None)
+        if not is_high and scale >= 1 / OTHER_SCALE:  # the origin of an open rig may be above the road, not below
+            return ""
+        return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
+
+    def _late_or_elsewhere(self, chosen: Candidate, reading: PoseReading) -> str:
+        """What the poses are with which the images fit much better: late, or of another point; "" if nothing."""
+        assert self._points is not None
+        points, track = self._points, _tracks(replace(self._poses, readings=(reading,)), self._times)[0]
+        at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64)
+        body = self._cameras(chosen.rig)[reading.camera] if reading.camera else np.eye(4)
+
+        def residual_px(place: Array, late_ns: int = 0) -> float:
             steps = place @ body_motions(track.at(at - late_ns)[0]) @ inverse(place)
             return points.residual_px(chosen.cameras, steps)
-
-        def moved_px(place: Array) -> float:
-            return residual_px(rigid(place, body[:3, :3]), 0)
 
         changes = [
             (residual_px(body, sign * late_ns), f"{late_ns // 10**6} ms {word}")
             for late_ns, (sign, word) in product(LATE_NS, ((1, "later"), (-1, "earlier")))
         ]
-        start = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-        limits = {"initial_simplex": start, "maxfev": TRIED_POINTS}
+        limits = {"initial_simplex": np.eye(4, 3, -1), "maxfev": TRIED_POINTS}
         best = minimize(
-            lambda x: residual_px(rigid(x, body[:3, :3]), 0), start[0], method="Nelder-Mead", options=limits
+            lambda x: residual_px(rigid(x, body[:3, :3])), np.zeros(3), method="Nelder-Mead", options=limits
         )
-        x, y, z = best.x
         if np.linalg.norm(best.x) < FARTHEST_POINT_M:
-            changes.append(
-                (best.fun, f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin")
-            )
+            x, y, z = best.x
+            place = f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"
+            changes.append((best.fun, place))
         without, text = min(changes)
         if chosen.residual_px <= OFF * without or without > LEAST_OFF_PX:
             return ""
-        return (
-            f"{chosen.poses.words()} fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if "
-            f"the poses are {text}"
-        )
+        fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if the poses are {text}"
+        return f"{reading.words()} {fit}"
 
     def _on_both_sides(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> tuple[Candidate, str]:
         """The one of several axes of a rig in which most cameras have one like them on the other side of the vehicle.
@@ -393,14 +395,18 @@ class Judged:
 
     def _missing_height(self, chosen: Candidate) -> float | None:
         """By how much the cameras are higher above the road than the file states, metres; None where it is not seen."""
+        if (seen_m := self._height_seen(chosen)) is None:
+            return None
+        stated = float(np.mean(chosen.cameras[:, 2, 3]))
+        up = seen_m - stated
+        return up if abs(up) > max(SAME_HEIGHT_M, SAME_HEIGHT * stated) else 0.0
+
+    def _height_seen(self, chosen: Candidate) -> float | None:
+        """The mean height of the cameras above the road by the images, metres; None where it is not clear."""
         if self._points is None or self._poses.motion is None:
             return None
         seen = height_above_road(self._points, chosen.cameras, chosen.steps)
-        if seen is None or seen.clearness < CLEAR_HEIGHT:
-            return None
-        stated = float(np.mean(chosen.cameras[:, 2, 3]))
-        up = seen.height_m - stated
-        return up if abs(up) > max(SAME_HEIGHT_M, SAME_HEIGHT * stated) else 0.0
+        return None if seen is None or seen.clearness < CLEAR_HEIGHT else seen.height_m
 
 
 def _tracks(poses: ReadPoses, times_ns: NDArray[np.int64]) -> dict[int, Poses]:
