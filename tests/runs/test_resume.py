@@ -203,7 +203,8 @@ def test_a_folder_that_is_deleted_during_the_run_is_an_error(model, tmp_path):
     with contextlib.ExitStack() as stack:
         running = stack.enter_context(stepped(model, tmp_path / "out"))
         next(running.frames)
-        shutil.rmtree(tmp_path / "out")
+        (tmp_path / "out").rename(tmp_path / "gone")  # at once: the run writes on while a folder is deleted
+        shutil.rmtree(tmp_path / "gone")
         with pytest.raises(OutputError, match=r"deleted|cannot be written"):
             list(running.frames)
         with pytest.raises(OutputError, match=r"deleted|cannot be written"):
