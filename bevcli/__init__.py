@@ -47,8 +47,7 @@ if TYPE_CHECKING:
     from bevcli.workshop.batch.batch import batch as batch
     from bevcli.workshop.calibration.calibrate import calibrate as calibrate
     from bevcli.workshop.engines.exported import export_onnx as export_onnx, quantize as quantize
-    from bevcli.workshop.formats.convert import convert as convert
-    from bevcli.workshop.formats.export import export as export
+    from bevcli.workshop.formats.convert import convert as convert, export as export
     from bevcli.workshop.live import Session as Session
     from bevcli.workshop.odometry.measure import measure_motion as measure_motion
     from bevcli.workshop.scores.compare import compare as compare

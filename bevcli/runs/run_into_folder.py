@@ -35,7 +35,7 @@ from bevcli.sequences.images import no_image_error
 from bevcli.writing import partial_path, whole_file, write_whole
 
 if TYPE_CHECKING:
-    from bevcli.workshop.formats.submission import SubmissionWriter
+    from bevcli.workshop.formats.nuscenes_output import SubmissionWriter
 
 
 RECORDING, PREDICTIONS, SUBMISSION = "recording.rrd", "predictions.json", "results_nusc.json"
@@ -208,7 +208,7 @@ class RunFiles:
         return file
 
     def _open_submission(self) -> "SubmissionWriter":
-        from bevcli.workshop.formats.submission import SubmissionWriter  # nuScenes drives only
+        from bevcli.workshop.formats.nuscenes_output import SubmissionWriter  # nuScenes drives only
 
         return self._open(SUBMISSION, SubmissionWriter)
 

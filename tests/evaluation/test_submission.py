@@ -16,7 +16,7 @@ from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, yaw_of_quaternion
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
-from bevcli.workshop.formats.submission import SubmissionWriter, is_submission, read_submission, write_submission
+from bevcli.workshop.formats.nuscenes_output import SubmissionWriter, is_submission, read_submission, write_submission
 
 ALLOWED_ATTRIBUTES = {
     "pedestrian": {"pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing"},

@@ -19,7 +19,7 @@ from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
 from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
-from bevcli.workshop.formats.submission import write_submission
+from bevcli.workshop.formats.nuscenes_output import write_submission
 from bevcli.workshop.scores.record import names_of, record, record_steps
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 

@@ -11,7 +11,7 @@ from bevcli.errors import InputError
 from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats.camera_names import match_names
+from bevcli.workshop.formats.matching import match_names
 
 START_S = 1_772_366_400  # 2026-03-01 12:00:00 in UTC
 

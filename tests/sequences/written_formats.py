@@ -232,17 +232,19 @@ class WrittenFormat:
 
     Attributes:
         write: the frames and the folder.
-        module: of the reader.
+        mapping: "module:attribute" of the classes of its categories.
         options: of the format, for what the writer writes.
     """
 
     write: Callable[[Sequence[Frame], Path], None]
-    module: str
+    mapping: str
     options: dict[str, Any]
 
 
 WRITTEN = {
-    "dgp": WrittenFormat(write_dgp, "bevcli.workshop.formats.dgp", {}),
-    "argoverse2": WrittenFormat(write_argoverse2, "bevcli.workshop.formats.argoverse2", {"distorted": True}),
-    "t4": WrittenFormat(write_t4, "bevcli.workshop.formats.t4", {}),
+    "dgp": WrittenFormat(write_dgp, "bevcli.workshop.formats.dgp:CLASS_OF_CATEGORY", {}),
+    "argoverse2": WrittenFormat(
+        write_argoverse2, "bevcli.workshop.formats.argoverse2:CLASS_OF_CATEGORY", {"distorted": True}
+    ),
+    "t4": WrittenFormat(write_t4, "bevcli.workshop.formats.nuscenes:T4_CLASS_OF_CATEGORY", {}),
 }

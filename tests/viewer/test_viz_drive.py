@@ -22,7 +22,7 @@ from bevcli.errors import InputError
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.formats.submission import write_submission
+from bevcli.workshop.formats.nuscenes_output import write_submission
 
 ROOT = Path(__file__).parents[2]
 FRAMES = 3

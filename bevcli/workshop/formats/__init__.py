@@ -114,7 +114,7 @@ class T4Dataset(Format):
 
     name = "a T4 dataset"
     expected = "annotation/sample_data.json"
-    reader = "bevcli.workshop.formats.t4:open_t4"
+    reader = "bevcli.workshop.formats.nuscenes:open_t4"
     annotated = True
 
     @classmethod

@@ -30,12 +30,11 @@ from bevcli.workshop.formats.camera_poses import (
     raised,
     rig_readings,
 )
-from bevcli.workshop.formats.information_files import read_information
 from bevcli.workshop.formats.kitti import KITTI_FILES, read_kitti
 from bevcli.workshop.formats.markup import YAML_BYTES
 from bevcli.workshop.formats.matching import cameras_with_images, first_images, size_of_first
 from bevcli.workshop.formats.named_calibration import SUFFIXES, read_document, read_named
-from bevcli.workshop.formats.other_calibrations import read_colmap, read_nerfstudio, read_vins_fusion
+from bevcli.workshop.formats.other_calibrations import read_colmap, read_information, read_nerfstudio, read_vins_fusion
 
 ByCamera = float | Mapping[str, float] | None  # one number for all cameras, or one for each
 FOV_DEG = (5, 170)  # of a pinhole camera

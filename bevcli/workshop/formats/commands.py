@@ -55,7 +55,7 @@ def export(
     KITTI labels are the boxes that one camera sees, in the camera frame. Of a recording, the shown boxes are written:
     those above the score of the run.
     """
-    from bevcli.workshop.formats.export import export_boxes
+    from bevcli.workshop.formats.convert import export_boxes
 
     target, what, note = export_boxes(predictions, options)
     if note:

@@ -1,4 +1,4 @@
-"""`convert`: write any input as a drive of another format."""
+"""`convert` and `export`: write any input as a drive of another format, and boxes as a file of another format."""
 
 import importlib.util
 import os
@@ -11,17 +11,28 @@ from typing import Any
 from bevcli.errors import BevcliError, InputError, OutputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import IMPOSSIBLE
-from bevcli.options import spread
+from bevcli.options import gather, spread
 from bevcli.printing import counted
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes, write_boxes
+from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats import LabelOptions, WriteOptions
+from bevcli.viewer.recording_file import open_recording
+from bevcli.viewer.recording_reader import read_recording
+from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
+from bevcli.workshop.formats.kitti import export_kitti
 from bevcli.workshop.formats.labels import with_labels
-from bevcli.workshop.formats.nuscenes_writer import NuScenesWriter
+from bevcli.workshop.formats.nuscenes_output import NuScenesWriter, write_submission
 from bevcli.workshop.formats.output import DriveWriter, NativeWriter
+from bevcli.writing import check_output
 
 NAMES = {"mcap": "an MCAP file", "native": "a sequence folder", "nuscenes": "a nuScenes root"}
+# Format -> the name of the file or folder that is written next to the boxes by default.
+TARGETS = {
+    "csv": "boxes.csv", "json": "boxes.json", "kitti": "kitti", "nuscenes": "results_nusc.json",
+    "nuscenes-tracking": "tracking_nusc.json",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,3 +124,52 @@ def truth_left_out(frame: Frame, form: str) -> set[str]:
     """The ground truth of a frame that a format cannot hold, in words: sequence folders keep maps and lines."""
     maps = {"maps": frame.ground_truth_map, "lines of the map": frame.ground_truth_results or None}
     return set() if form == "native" else {name for name, value in maps.items() if value is not None}
+
+
+def export(predictions: str | Path, options: ExportOptions | None = None, **changes: Any) -> tuple[Path, str]:
+    """Write boxes as a table, a boxes file, KITTI labels or a nuScenes submission, as `bevcli export` does.
+
+        bevcli.export("runs/first", form="csv")
+
+    Args:
+        predictions: predictions.json, ground_truth.json, the folder of a run, or a recording, whose shown boxes are
+            written.
+        options: see `ExportOptions`; or as keywords.
+        changes: the options as keywords: `form` ("csv", "json", "kitti", "nuscenes", "nuscenes-tracking"), `out`,
+            `score`, `calibration` and `camera`.
+
+    Returns the file or folder, and what was written, such as "20 boxes".
+
+    Raises InputError for predictions that cannot be read or that the format cannot hold, and OutputError.
+    """
+    target, what, _ = export_boxes(Path(predictions), gather(ExportOptions, options, changes))
+    return target, what
+
+
+def export_boxes(predictions: Path, options: ExportOptions) -> tuple[Path, str, str]:
+    """Write boxes, see `export`: the file, what was written, and a note where a recording is incomplete, or ""."""
+    if options.form not in TARGETS:
+        raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(TARGETS)})")
+    file = predictions / "predictions.json" if predictions.is_dir() else predictions
+    target = options.out or file.parent / TARGETS[options.form]
+    check_output(target, file)
+    boxes, note = _boxes_of(file)
+    return target, _write(above_score(boxes, options.score), target, options, file), note
+
+
+def _boxes_of(file: Path) -> tuple[BoxesFile, str]:
+    """The boxes of a boxes file or of a recording, and a note."""
+    if file.suffix.lower() != ".rrd":
+        return read_boxes(file), ""
+    with open_recording(file) as whole:
+        note = "" if whole == file else f"{file} is incomplete (its run was stopped or is still going)"
+        return read_recording(whole), note
+
+
+def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
+    """Write boxes of a file, and say what, such as "20 frames, 3 tracks"."""
+    if options.form == "kitti":
+        return export_kitti(boxes, target, options, source)
+    if options.form in ("csv", "json"):
+        return counted((write_csv if options.form == "csv" else write_boxes)(boxes, target), "boxes")
+    return counted(write_submission(boxes, target, tracking=options.form == "nuscenes-tracking"), "samples")

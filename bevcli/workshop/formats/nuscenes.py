@@ -1,4 +1,4 @@
-"""A nuScenes dataset root as a drive, with the rig, the poses and the CAN bus data of each scene."""
+"""A nuScenes root or a T4 dataset as a drive, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,7 +15,9 @@ from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, brown_
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.files import is_there
+from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
+from bevcli.sequences.format import Format
 from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import NuScenesOptions
@@ -37,6 +39,29 @@ from bevcli.workshop.formats.nuscenes_tables import open_index, read_rows
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = tuple(NUSCENES_YAWS_DEG)
+# T4 datasets of TIER IV, as Autoware uses them: nuScenes' tables with additions.
+T4_LIDARS = ("LIDAR_CONCAT", "LIDAR_TOP")
+# The documented meaning: not occluded, by less than half, by more than half, and by 90 to 100 %.
+T4_VISIBILITIES = {"full": 1.0, "most": 0.75, "partial": 0.3, "none": 0.05}
+
+# Class names; docs/other-inputs.md says what is lost. Older datasets have the longer names. Names are compared without
+# case; others stay as they are, and are not scored.
+T4_CATEGORIES_OF_CLASS = {
+    "car": ("vehicle.car", "police_car", "vehicle.police", "vehicle.emergency (ambulance & police)"),
+    "truck": ("ambulance", "vehicle.ambulance", "fire_truck", "vehicle.fire", "vehicle.truck"),
+    "construction_vehicle": ("forklift", "vehicle.construction"),
+    "bus": ("vehicle.bus", "vehicle.bus (bendy & rigid)"),
+    "trailer": ("vehicle.trailer", "semi_trailer"),
+    "motorcycle": ("motorbike", "vehicle.motorbike", "vehicle.motorcycle"),
+    "bicycle": ("vehicle.bicycle",),
+    "pedestrian": (
+        "construction_worker", "police_officer", "pedestrian.adult", "pedestrian.child",
+        "pedestrian.construction_worker", "pedestrian.police_officer",
+    ),
+    "barrier": ("movable_object.barrier",),
+    "traffic_cone": ("movable_object.trafficcone", "movable_object.traffic_cone"),
+}  # fmt: skip
+T4_CLASS_OF_CATEGORY = {name: class_name for class_name, names in T4_CATEGORIES_OF_CLASS.items() for name in names}
 
 
 @dataclass(frozen=True)
@@ -256,3 +281,14 @@ def _camera(index: NuScenesIndex, sensor: int, image: int, tables: Path) -> Came
     source = f"{tables}: sample_data.json and calibrated_sensor.json"
     ego_from_camera, name = _pose_of(index.sensors, sensor).matrix, str(index.sensors.channels[sensor])
     return checked_camera(Camera(name, width, height, intrinsics, ego_from_camera, lens), source)
+
+
+def open_t4(path: Path, common: InputOptions, options: Format) -> TableDrive:
+    """The keyframes of a T4 dataset.
+
+    The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
+    lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableDrive`.
+    """
+    names = ClassNames.of_format(T4_CLASS_OF_CATEGORY, common.class_map)
+    dialect = Dialect(T4_LIDARS, names.__getitem__, T4_VISIBILITIES, has_attributes=False, bev_is_lidar=False)
+    return TableDrive(path, path / "annotation", common, dialect, NuScenesOptions())

@@ -22,8 +22,8 @@ from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import NuScenesOptions, is_nuscenes_root
 from bevcli.workshop.formats.nuscenes_index import chosen_scenes, tables_of
+from bevcli.workshop.formats.nuscenes_output import is_submission, read_submission
 from bevcli.workshop.formats.nuscenes_tables import open_index
-from bevcli.workshop.formats.submission import is_submission, read_submission
 from bevcli.workshop.scores.detection import DetectionScores
 
 

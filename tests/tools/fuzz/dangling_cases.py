@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from bevcli.sequences.open import open_sequence
-from bevcli.workshop.formats.nuscenes_writer import TABLES
+from bevcli.workshop.formats.nuscenes_output import TABLES
 from bevcli.workshop.training.trainer import load_checkpoint
 
 VALUES = (-6, 0, 2**70, float("nan"), float("inf"), "2", None, [], {})
