@@ -13,7 +13,7 @@ from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.road import followed, level_corrections, sees_road
 from bevcli.workshop.calibration.views import PointMatches, View, Views, depths_of, unknowns_of
-from bevcli.workshop.correspondence.points import FEWEST_AT_ONCE, Features, matched, texture
+from bevcli.workshop.correspondence.images import FEWEST_AT_ONCE, Features, matched, points_of_road, texture
 from bevcli.workshop.correspondence.residuals import (
     EpipolarResiduals,
     RoadResiduals,
@@ -22,7 +22,6 @@ from bevcli.workshop.correspondence.residuals import (
     spread,
     values,
 )
-from bevcli.workshop.correspondence.road import points_of_road
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 BLANK = np.zeros((2, 2), dtype=np.uint8)

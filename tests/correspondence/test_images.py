@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bevcli.workshop.correspondence.points import GreyImage, features, texture
+from bevcli.workshop.correspondence.images import GreyImage, features, texture
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40)).repeat(6, axis=0).repeat(6, axis=1).astype(np.uint8)
 LEFT = np.arange(240) < 120

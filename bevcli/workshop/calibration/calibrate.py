@@ -51,7 +51,7 @@ from bevcli.workshop.calibration.views import (
     read_views,
     unknowns_of,
 )
-from bevcli.workshop.correspondence.points import WIDTH
+from bevcli.workshop.correspondence.images import WIDTH
 from bevcli.workshop.correspondence.residuals import (
     DepthResiduals,
     RoadResiduals,

@@ -18,17 +18,8 @@ from scipy.sparse.csgraph import connected_components
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.calibration.estimates import HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.views import Views
-from bevcli.workshop.correspondence.points import THREADS
-from bevcli.workshop.correspondence.residuals import (
-    SHORTEST,
-    EpipolarResiduals,
-    GroupGeometry,
-    Indices,
-    RoadResiduals,
-    geometry_at,
-    values,
-)
-from bevcli.workshop.correspondence.road import (
+from bevcli.workshop.correspondence.images import (
+    THREADS,
     RoadPoints,
     beside_way,
     correlation,
@@ -37,6 +28,15 @@ from bevcli.workshop.correspondence.road import (
     road_points,
     tiles,
     votes,
+)
+from bevcli.workshop.correspondence.residuals import (
+    SHORTEST,
+    EpipolarResiduals,
+    GroupGeometry,
+    Indices,
+    RoadResiduals,
+    geometry_at,
+    values,
 )
 
 FAR_M, STEP_M = 0.6, 0.03  # of the corrections that are tried

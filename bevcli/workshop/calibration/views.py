@@ -15,7 +15,7 @@ from bevcli.geometry.ego_motion import EgoMotion, motion_during
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import DELAYS_S, OF_PAIR, Unknowns
-from bevcli.workshop.correspondence.points import (
+from bevcli.workshop.correspondence.images import (
     THREADS,
     WIDTH,
     GreyImage,

@@ -3,10 +3,10 @@
 In the order of the work:
     step_views    what is kept of a frame, points matched in two of them and of the road, what is estimated
     steps         votes how far the vehicle drove, and the motions that fit matched points and points of the road
-    measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig
+    measure       the entry point: the measured motion, chosen frame by frame, of a drive or of a live rig;
+                  measured steps, and how far stated ones are from them
     report        the measured motion in words and files, and the option `odometry` of `open_sequence`
     picture       odometry.png and odometry.rrd: the way on the road, and curves
-    measured_steps  measured steps, and how far stated ones are from them
     compare       stated poses against the measured motion, and the check of `bevcli project-debug`
 """
 

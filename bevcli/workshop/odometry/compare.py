@@ -19,8 +19,7 @@ from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.sequences.open import DriveView
 from bevcli.workshop.correspondence.poses import Poses, steps_between
-from bevcli.workshop.odometry.measure import MeasuredMotion, MeasuredStep, measure_steps
-from bevcli.workshop.odometry.measured_steps import FREEDOMS, MeasuredSteps
+from bevcli.workshop.odometry.measure import FREEDOMS, MeasuredMotion, MeasuredStep, MeasuredSteps, measure_steps
 from bevcli.workshop.readings.stated import fitting_poses
 
 FEWEST_STEPS = 3  # that are measured

@@ -24,7 +24,7 @@ from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.images import encode_image
 from bevcli.recording import entities
 from bevcli.recording.blueprint import Layout, camera_rows, flat_view, frame_rate_hz
-from bevcli.workshop.correspondence.road import sampled
+from bevcli.workshop.correspondence.images import sampled
 from bevcli.workshop.odometry.measure import MeasuredMotion
 from bevcli.workshop.odometry.report import KMH, lengths_m, speeds, yaw_rates_deg
 from bevcli.workshop.odometry.step_views import nearest_cameras

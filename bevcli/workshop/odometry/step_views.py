@@ -16,14 +16,17 @@ from scipy.spatial.transform import Rotation
 from bevcli.frame import Frame
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig
 from bevcli.geometry.transforms import Array, inverse, rigid
-from bevcli.workshop.correspondence.points import (
+from bevcli.workshop.correspondence.images import (
     Features,
     GreyImage,
+    contrast,
     features,
+    flow_at,
     grey_image,
     matched,
     neighbours,
     reduced,
+    sampled,
     texture,
 )
 from bevcli.workshop.correspondence.residuals import (
@@ -33,7 +36,6 @@ from bevcli.workshop.correspondence.residuals import (
     Residuals,
     rays_of_road_points,
 )
-from bevcli.workshop.correspondence.road import contrast, flow_at, sampled
 
 CELL_M = 0.08
 BEGIN_M, SHAPE = (-24.0, -9.0), (225, 640)  # the smallest x and y; cells along y and x

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array
+from bevcli.workshop.correspondence.images import RoadPoints, road_points
 from bevcli.workshop.correspondence.residuals import (
     EpipolarResiduals,
     GroupGeometry,
@@ -21,7 +22,6 @@ from bevcli.workshop.correspondence.residuals import (
     spread,
     values,
 )
-from bevcli.workshop.correspondence.road import RoadPoints, road_points
 from bevcli.workshop.odometry.step_views import (
     BEGIN_M,
     CELL_M,

@@ -1,9 +1,8 @@
 """The images decide between the readings of a rig and of poses.
 
 In the order of the work:
-    pairs         two frames between which the vehicle moved: points of each camera that match, and the images
-    residuals     how far matched points are from where a reading puts them
-    heights       how high the cameras are above the road, by the poses and the images
+    pairs         two frames between which the vehicle moved: how far matched points are from where a reading puts them,
+                  and how high the cameras are above the road
     judge         the reading that the images show, or the question to the user
     stated        what stated poses are where the images contradict them, for `bevcli project-debug`
 

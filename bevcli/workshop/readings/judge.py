@@ -23,9 +23,14 @@ from bevcli.workshop.formats.calibrations import poses_in_words
 from bevcli.workshop.formats.camera_poses import on_both_sides
 from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S, in_usual_axes
 from bevcli.workshop.formats.poses import of_reading
-from bevcli.workshop.readings.heights import height_above_road
-from bevcli.workshop.readings.pairs import camera_pairs, moving_pairs, timed_pairs
-from bevcli.workshop.readings.residuals import MatchedPoints, body_motions
+from bevcli.workshop.readings.pairs import (
+    MatchedPoints,
+    body_motions,
+    camera_pairs,
+    height_above_road,
+    moving_pairs,
+    timed_pairs,
+)
 
 SOUND_PX = (2.5, 1.0, 0.7)  # largest residual of a reading that is believed, reduced pixels, by its rank
 CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger

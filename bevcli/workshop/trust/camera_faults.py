@@ -19,7 +19,7 @@ from scipy.stats import t as student_t
 from bevcli.errors import Finding
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
-from bevcli.workshop.correspondence.points import matched, neighbours
+from bevcli.workshop.correspondence.images import matched, neighbours
 from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, solve
 from bevcli.workshop.odometry.step_views import FrameView
