@@ -16,7 +16,7 @@ Group = Literal["bevcli.models", "bevcli.sequences", "bevcli.engines", "bevcli.c
 # Group -> name -> "module:attribute".
 OWN: dict[Group, dict[str, str]] = {
     "bevcli.models": {
-        "BEVFormer": "bevcli.model.bevformer.bevformer:BEVFormer",
+        "BEVFormer": "bevcli.model.bevformer:BEVFormer",
         "BEVFormerV2": "bevcli.workshop.bevformer_v2:BEVFormerV2",
         "UniAD": "bevcli.workshop.uniad.uniad:UniAD",
         "VAD": "bevcli.workshop.vad.vad:VAD",

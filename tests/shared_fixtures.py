@@ -17,7 +17,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.machine import keep_freed_memory
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig

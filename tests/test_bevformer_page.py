@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from bevcli.config import load_config
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.workshop.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
 
 ROOT = Path(__file__).parents[1]

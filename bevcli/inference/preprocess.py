@@ -1,6 +1,10 @@
-"""From a frame to the network's input. Images are resized only here, together with their calibration."""
+"""From a frame to the network's input, and from boxes in that input back to the cameras' images.
+
+Images are resized only here, together with their calibration.
+"""
 
 import os
+import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -15,16 +19,20 @@ from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, ColorOrder, Frame
+from bevcli.geometry.boxes import Boxes2D
 from bevcli.geometry.cameras import Camera, CameraRig, level_rig
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.image_repair import repaired
 from bevcli.jit import njit
 from bevcli.model.config import ImageConfig, ModelConfig
+from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
 from bevcli.model.road_slopes import GreyView
 from bevcli.model.step import CameraAssignment, PreparedFrame, assign_cameras
 
 GREY_WIDTH = 352  # pixels of the images in which points are followed
 WriteImage = Callable[[NDArray[np.uint8], ImageConfig, NDArray[Any]], None]  # (H, W, 3), size and mean, (3, H', W')
+LEAST_SCORE = 0.05  # what is scored below is nothing
+POINTS_OF_SIDE = 9  # of a box that is bent by a lens; the rectangle around them is the box
 
 
 class Preprocessor:
@@ -343,3 +351,36 @@ def _check_image(pixels: NDArray[Any], camera: Camera) -> None:
             f"`images`: camera {camera.name}: expected uint8 of shape ({camera.height}, {camera.width}, 3), as in the "
             f"rig (found {found})"
         )
+
+
+def camera_boxes(found: ImageBoxes, prepared: PreparedFrame, image: ImageConfig) -> dict[str, Boxes2D]:
+    """Camera -> the boxes in its image as it was read, for the cameras that have an image.
+
+    Cropping and resizing are undone. Where the image was undistorted for the network, the outline of a box is led
+    through the lens, and the box becomes the rectangle around it. A box that is then outside of the image is left out.
+
+    found: of a batch of one, on the CPU. prepared: the frame. image: of the model.
+    """
+    boxes = {}
+    for index, (name, scale) in enumerate(zip(prepared.assignment.cameras, prepared.scales, strict=True)):
+        if not prepared.has_image[0, index]:
+            continue
+        resized = found.boxes[0, index].double().numpy() + np.tile(image.crop_box[:2], 2) + 0.5
+        corners, scores = in_image(resized / scale - 0.5, prepared.frame.rig[name]), found.scores[0, index].numpy()
+        chosen = (scores >= LEAST_SCORE) & (corners[:, 2:] > corners[:, :2]).all(1)  # False for NaN
+        classes = np.array(IMAGE_CLASSES)[found.labels[0, index].numpy()]
+        boxes[name] = Boxes2D(corners[chosen], classes[chosen], scores[chosen].astype(np.float64))
+    return boxes
+
+
+def in_image(corners: Array, camera: Camera) -> Array:
+    """Boxes (N, 4) of the undistorted image -> those in the camera's image, clipped to it; NaN behind the lens."""
+    if camera.distortion is not None:
+        share = np.linspace(0, 1, POINTS_OF_SIDE)
+        ends = np.stack([np.zeros_like(share), np.ones_like(share)])
+        x = np.concatenate([share, share, *ends])[:, None] * (corners[:, 2] - corners[:, 0]) + corners[:, 0]
+        y = np.concatenate([*ends, share, share])[:, None] * (corners[:, 3] - corners[:, 1]) + corners[:, 1]
+        outline = camera.distorted(np.stack([x, y], -1))  # (points, N, 2)
+        with warnings.catch_warnings(action="ignore"):  # of boxes with NaN only
+            corners = np.concatenate([np.nanmin(outline, 0), np.nanmax(outline, 0)], -1)
+    return np.clip(corners, -0.5, np.tile((camera.width, camera.height), 2) - 0.5)

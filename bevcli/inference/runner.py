@@ -17,9 +17,8 @@ from bevcli.frame import BevMap, Drive, Frame, FrameResult, FrameStamp, NewStart
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference import StepOptions
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
-from bevcli.inference.image_boxes import camera_boxes
 from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.network import Network

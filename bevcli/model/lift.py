@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
-from bevcli.model.road_slopes import SPREAD, RoadSlopes
-from bevcli.model.upright_images import adjugate_of_three
+from bevcli.model.road_slopes import SPREAD, RoadSlopes, adjugate_of_three
 
 NAMES = {"person": "pedestrian"}  # names of classes that are other ones in images
 # Of each image class: mean width, length and height of its objects, metres.

@@ -19,12 +19,11 @@ from bevcli.model.hybrid_queries import HybridQueries
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
-from bevcli.model.road_slopes import RoadSlopes
+from bevcli.model.road_slopes import RoadSlopes, upright_images
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.model.upload import on_device, upload_together, without_autocast
-from bevcli.model.upright_images import upright_images
 
 STAGES = {name: name for name in ("backbone", "neck", "encoder", "decoder", "segmentation_head")}
 CAMERA_EMBEDDING = "image_tokens.camera_embedding"  # the key of the tensor that has a row for each camera

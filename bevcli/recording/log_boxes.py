@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 
 from bevcli.frame import Frame, FrameStamp, Prediction
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes2D, Boxes3D
-from bevcli.geometry.matching import MATCH_DISTANCE_M, ScoredBoxes, descending_scores, match_greedily
+from bevcli.geometry.boxes import (
+    MATCH_DISTANCE_M,
+    OPTIONAL_COLUMNS,
+    Boxes2D,
+    Boxes3D,
+    ScoredBoxes,
+    descending_scores,
+    match_greedily,
+)
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, GeoOrigin, apply
 from bevcli.recording import entities

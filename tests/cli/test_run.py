@@ -17,7 +17,7 @@ from bevcli.cli.run import _run_notes
 from bevcli.errors import BevcliError, OutputError
 from bevcli.frame import MAP_CLASSES
 from bevcli.inference.load import Model
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_into_folder
 from bevcli.sequences.files.boxes_file import read_boxes

@@ -18,7 +18,7 @@ from bevcli.errors import BevcliError, WeightsError
 from bevcli.geometry.object_classes import SHOWN_SCORE
 from bevcli.inference.load import Model, load_model
 from bevcli.inference.run import run
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.image_tokens import ImageTokensConfig

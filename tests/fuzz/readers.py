@@ -97,7 +97,7 @@ def _recording(folder: Path) -> None:
 
 
 def _state(folder: Path) -> None:
-    from bevcli.model.bevformer.bevformer import BevHistory
+    from bevcli.model.bevformer import BevHistory
     from bevcli.runs.state import RunFolder, RunState, saved_state
 
     with RunFolder(folder / "out", resume=True) as out:

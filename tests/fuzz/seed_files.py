@@ -23,7 +23,7 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.runner import RunnerState
-from bevcli.model.bevformer.bevformer import BevHistory
+from bevcli.model.bevformer import BevHistory
 from bevcli.runs.state import RunState, save_state
 from bevcli.runs.summary import Counts
 from bevcli.sequences.files.ego_motion_file import read_ego_motion

@@ -8,8 +8,7 @@ import torch
 from memory_drive import MemoryDrive, make_camera
 
 from bevcli.geometry.cameras import CameraRig, Distortion, default_ego_from_bev
-from bevcli.inference.image_boxes import camera_boxes
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.step import PreparedFrame
 

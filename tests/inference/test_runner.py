@@ -13,7 +13,7 @@ from bevcli.errors import InputError, WeightsError
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner, RunnerState
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
 

@@ -23,7 +23,7 @@ from bevcli.config import load_config
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_from_quaternion
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.ego_motion import EgoMotionInputs, ego_motion_inputs
 from bevcli.model.step import ModelInputs

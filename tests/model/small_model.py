@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig

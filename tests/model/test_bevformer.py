@@ -7,7 +7,7 @@ import torch
 from small_model import small_inputs, small_model
 
 from bevcli.inference.attention import AttentionProbe
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelInputs, ModelOutputs
 

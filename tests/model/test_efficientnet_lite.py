@@ -14,7 +14,7 @@ from torch import nn
 
 from bevcli.config import as_table, config_of_table
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLite, EfficientNetLiteConfig
 from bevcli.model.kernels.onednn import PackedConvolution, has_onednn
 from bevcli.model.network import Network

@@ -15,7 +15,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.cameras import default_ego_from_bev
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import Pose, apply, inverse
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.ego_motion import EgoMotionConfig, EgoMotionInputs, ego_motion_inputs, rotate_history
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokensConfig, ray_features

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from bevcli.geometry.transforms import wrap_angle
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.step import ModelInputs, ModelOutputs
 

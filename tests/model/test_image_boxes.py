@@ -10,7 +10,7 @@ from small_model import HEIGHT, WIDTH, small_config, small_inputs
 from torch import Tensor
 
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.hybrid_queries import HybridQueriesConfig, rectangles_of
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, best_image_boxes, without_doubles
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig, hidden_feet

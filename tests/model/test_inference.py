@@ -9,7 +9,7 @@ from small_model import small_inputs, small_model
 from torch import nn
 
 from bevcli.model import prepare
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.kernels.choose import change_classes, fold_batch_norms
 from bevcli.model.prepare import TokensInBlocks, prepare_for_inference

@@ -7,7 +7,7 @@ import torch
 
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.model import prepare
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.kernels.onednn import has_matrix_unit
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs

@@ -5,8 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bevcli.model.road_slopes import level_from_bev
-from bevcli.model.upright_images import upright_cameras, upright_images
+from bevcli.model.road_slopes import level_from_bev, upright_cameras, upright_images
 
 WIDTH, HEIGHT = 160, 96
 INTRINSICS = torch.tensor([[120.0, 0, 79.5], [0, 120, 47.5], [0, 0, 1]])

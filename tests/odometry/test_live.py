@@ -12,7 +12,7 @@ import bevcli
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import FrameStamp, StartReason
 from bevcli.geometry.transforms import Pose, inverse, rigid
-from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
+from bevcli.model.bevformer import BEVFormer, BevHistory
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.workshop.bevformer_v2 import BEVFormerV2, FeatureWindow, FrameFeatures

@@ -21,7 +21,7 @@ from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference.load import Model
 from bevcli.inference.run import run
 from bevcli.inference.runner import read_commands, with_command
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.nanodet import NanoDet, NanoDetConfig

@@ -15,7 +15,7 @@ from bevcli.errors import OutputError
 from bevcli.frame import FrameStamp
 from bevcli.inference.load import Model
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.recording import RecordingOptions
 from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_in_folder, run_into_folder

@@ -23,7 +23,7 @@ from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import Pose
 from bevcli.inference.load import Model
 from bevcli.inference.runner import RunnerState
-from bevcli.model.bevformer.bevformer import BEVFormer, BevHistory
+from bevcli.model.bevformer import BEVFormer, BevHistory
 from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_in_folder
 from bevcli.runs.state import FORMAT, RunState, load_state, save_state

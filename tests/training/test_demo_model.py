@@ -12,7 +12,7 @@ from bevcli.errors import WeightsError
 from bevcli.frame import Drive
 from bevcli.inference.load import load_model
 from bevcli.inference.runner import Runner
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.sequences.open import select_range
 from bevcli.workshop.synth.drives import FolderDrives
 from bevcli.workshop.training.validation import score_drives

@@ -11,7 +11,7 @@ from painted_drives import CONFIG, PaintedDrives, batch_of
 from bevcli.checkpoints import load_weights
 from bevcli.config import as_table, as_toml as toml_of, load_config
 from bevcli.errors import ConfigError, WeightsError
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.model.network import build_network
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig

@@ -10,7 +10,7 @@ from painted_drives import CONFIG, PaintedDrives, batch_of
 
 from bevcli.config import TRAINING, load_table
 from bevcli.errors import ConfigError
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.fpn import FPNConfig
 from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.resnet import ResNetConfig

@@ -9,7 +9,7 @@ from forks import FORKS
 from painted_drives import CONFIG, PaintedDrives
 from torch import nn
 
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.workshop.training.job import (
     ProcessGroup,
     TrainingConfig,

@@ -18,7 +18,7 @@ from bevcli.checkpoints import load_weights
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.config import TRAINING, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError, OutputError, WeightsError
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.workshop.synth import DriveOptions, parse_seeds
 from bevcli.workshop.synth.drives import FIRST_HELD_OUT_SEED, RenderedDrives, scored_drives, training_drives
 from bevcli.workshop.training import TrainOptions

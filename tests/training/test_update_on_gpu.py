@@ -9,7 +9,7 @@ import torch
 from painted_drives import CONFIG, PaintedDrives
 from simulated_device import provide_training, simulated
 
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.workshop.training.augmentation import AugmentationConfig, RandomisationConfig
 from bevcli.workshop.training.frame_losses import DistillationLossConfig, PerspectiveLossConfig
 from bevcli.workshop.training.job import OptimizerConfig, TrainingConfig, TrainingJob

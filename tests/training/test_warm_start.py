@@ -21,7 +21,7 @@ from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
 from bevcli.inference.load import weights_file
 from bevcli.inference.training_rigs import facts_notes, weights_facts
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.workshop.training.trainer import save_weights

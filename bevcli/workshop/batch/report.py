@@ -19,8 +19,7 @@ import pyarrow.parquet as pq
 
 from bevcli._version import __version__
 from bevcli.frame import MAP_CLASSES
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import ScoredBoxes
+from bevcli.geometry.boxes import Boxes3D, ScoredBoxes
 from bevcli.geometry.object_classes import are_nuscenes
 from bevcli.inference.load import Model
 from bevcli.model.config import ModelConfig

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.deformable_attention import FeatureMaps
@@ -17,10 +17,9 @@ from bevcli.model.deformable_convolution import ModulatedDeformableConvolution, 
 from bevcli.model.ego_motion import rotate_history
 from bevcli.model.encoder import EncoderLayer, SpatialCrossAttention
 from bevcli.model.kernels.choose import fold_batch_norms
-from bevcli.model.road_slopes import SPREAD, RoadSlopes
+from bevcli.model.road_slopes import SPREAD, RoadSlopes, upright_cameras
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import model_class
-from bevcli.model.upright_images import upright_cameras
 
 Output = TypeVar("Output")
 

@@ -16,7 +16,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.object_classes import Color, ObjectClass
 from bevcli.parsing.files import MIB, open_regular, run_python
 from bevcli.recording.entities import EGO_COLOR, class_colors
-from bevcli.recording.meshes import Mesh, VehicleMesh
+from bevcli.recording.log_static import Mesh, VehicleMesh
 
 FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
 MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process

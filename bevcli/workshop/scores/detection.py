@@ -12,8 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import ConfigError
-from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
-from bevcli.geometry.matching import MATCH_DISTANCE_M, ScoredBoxes, descending_scores, match_greedily
+from bevcli.geometry.boxes import (
+    MATCH_DISTANCE_M,
+    OPTIONAL_COLUMNS,
+    Boxes3D,
+    ScoredBoxes,
+    descending_scores,
+    match_greedily,
+)
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array, wrap_angle
 

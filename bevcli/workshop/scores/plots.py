@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon
 from numpy.typing import NDArray
 
-from bevcli.geometry.matching import ScoredBoxes
+from bevcli.geometry.boxes import ScoredBoxes
 from bevcli.geometry.transforms import Array, apply, inverse
 from bevcli.printing import counted
 from bevcli.workshop.scores.detection import ERRORS, RECALLS, ClassScores, DetectionScores, ScoreTable

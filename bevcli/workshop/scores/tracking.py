@@ -13,8 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import MATCH_DISTANCE_M
+from bevcli.geometry.boxes import MATCH_DISTANCE_M, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.printing import number

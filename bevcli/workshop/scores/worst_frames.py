@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.geometry.matching import ScoredBoxes
+from bevcli.geometry.boxes import ScoredBoxes
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.format import is_drive
 from bevcli.workshop.formats import is_nuscenes_root

@@ -17,8 +17,7 @@ from bevcli.config import load_config
 from bevcli.errors import InputError
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes2D
-from bevcli.inference.image_boxes import camera_boxes
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.model.nanodet import NanoDet, NanoDetConfig
 from bevcli.parsing.documents import CSV_BYTES
 from bevcli.parsing.files import read_text

@@ -15,7 +15,7 @@ from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import ObjectQueries, boxes_of_codes, inverse_sigmoid
 from bevcli.model.ego_motion import EgoMotionConfig

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from shapely import LineString
 
-from bevcli.geometry.boxes import Boxes3D
-from bevcli.geometry.matching import MATCH_DISTANCE_M
+from bevcli.geometry.boxes import MATCH_DISTANCE_M, Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.formats.map_lines import MapLines
 

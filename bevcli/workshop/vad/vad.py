@@ -14,7 +14,7 @@ from bevcli.frame import BevMap, FrameResult
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.model.bevformer.bevformer import BEVFormer
+from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import (
     ConstantSelfAttention,

@@ -1,5 +1,6 @@
 """BEVFormer (Li et al. 2022): camera images and ego-motion in, a BEV map and objects out."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -13,10 +14,11 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.road_slopes import RoadMemory, RoadSlopes, expected_slopes
+from bevcli.model.road_slopes import RoadMemory, RoadSlopes, expected_slopes, upright_cameras
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import on_device, upload, upload_together
-from bevcli.model.upright_images import upright_cameras
+
+sys.modules[f"{__name__}.bevformer"] = sys.modules[__name__]  # its name in releases before 0.2
 
 
 @dataclass(frozen=True)

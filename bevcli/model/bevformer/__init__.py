@@ -1,1 +1,0 @@
-"""BEVFormer (Li et al. 2022)."""
