@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from bevcli.geometry.cameras import Camera as Camera, CameraRig as CameraRig, Distortion as Distortion
     from bevcli.geometry.ego_motion import Kinematics as Kinematics
     from bevcli.geometry.transforms import Pose as Pose
+    from bevcli.inference import run as run
     from bevcli.inference.load import Model as Model, load_model as load_model
-    from bevcli.inference.run import run as run
     from bevcli.recording import RecordingOptions as RecordingOptions
     from bevcli.recording.writer import Recording as Recording
     from bevcli.rig.check_calibration import check_calibration as check_calibration

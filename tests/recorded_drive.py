@@ -17,7 +17,7 @@ from bevcli.geometry.transforms import inverse
 from bevcli.model.config import ModelConfig
 from bevcli.recording import RecordingOptions
 from bevcli.recording.writer import Recording
-from bevcli.viewer.native import NO_DRIVER, take_screenshot
+from bevcli.viewer.rerun_viewer import NO_DRIVER, take_screenshot
 
 GRID = BevGrid(20, 20)
 TINY = load_config("tiny")

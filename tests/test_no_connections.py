@@ -52,6 +52,6 @@ def test_weights_are_never_fetched_without_being_asked(arguments, said, tmp_path
 
 
 def test_the_viewer_starts_without_telemetry():
-    from bevcli.viewer.native import viewer_environment
+    from bevcli.viewer.rerun_viewer import viewer_environment
 
     assert viewer_environment()["CI"] == "1"

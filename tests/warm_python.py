@@ -16,7 +16,7 @@ from bevcli.viewer.recording_file import CHECK_ENVIRONMENT
 # A child ends as `python -P -c CODE …` does, but without the interpreter's own end.
 SERVER = """
 import gc, json, os, sys, traceback
-import rerun.chunk, bevcli.workshop.meshes.mesh_file
+import rerun.chunk, bevcli.workshop.meshes, trimesh
 
 def end_of(code):
     try:

@@ -78,7 +78,7 @@ def run(
     out = output.out or Path("runs") / f"{drive.name}-{loaded.name}"
     live = None
     if output.live:
-        from bevcli.viewer.web import LiveView
+        from bevcli.viewer.rerun_viewer import LiveView
 
         live = LiveView()
     standing = StandingCheck() if source.ego_motion == "static" and run_options.temporal else None

@@ -11,7 +11,6 @@ from bevcli.printing import counted, say
 from bevcli.recording import RecordingOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer import ViewOptions
-from bevcli.viewer.native import display_is_there, show_window, take_screenshot
 from bevcli.viewer.recording_file import (
     RECORDING,
     check_is_drive,
@@ -20,7 +19,7 @@ from bevcli.viewer.recording_file import (
     recording_in as recording_in,
 )
 from bevcli.viewer.recording_reader import RecordingReader, summarise
-from bevcli.viewer.web import WebViewer, web_viewer_assets
+from bevcli.viewer.rerun_viewer import WebViewer, display_is_there, show_window, take_screenshot, web_viewer_assets
 
 
 def show(recording: Path, options: ViewOptions, name: Path | None = None) -> None:

@@ -1,12 +1,18 @@
-"""From a drive to Predictions: the options of a model, and those of its steps."""
+"""From a drive to Predictions: `run`, the options of a model, and those of its steps."""
 
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from bevcli.errors import InputError
 from bevcli.model import AnyPrecision
-from bevcli.options import option, options, parse_pairs
+from bevcli.options import option, options, parse_pairs, refuse, spread
 from bevcli.registry import entries, known_models
+
+if TYPE_CHECKING:
+    from bevcli.frame import Drive, Frame, Prediction
+    from bevcli.inference.load import Model
 
 PHOTOGRAPHS, RENDERED = "photographs", "demo"  # models of the package: for real images, for rendered ones
 TORCH = "torch"  # the value of `engine` beside the registered engines
@@ -111,3 +117,30 @@ class StepOptions:
     )
     attention: bool = False
     probes: tuple[tuple[float, float], ...] = ()
+
+
+def run(model: "Model", sequence: "Drive", **options: Any) -> Iterator[tuple["Frame", "Prediction"]]:
+    """Runs a model over a sequence, frame by frame; the BEV map of a frame is the history of the next.
+
+        for frame, prediction in bevcli.run(model, drive):
+            print(frame.stamp.index, len(prediction.boxes))
+
+    Frames are read and prepared in the background. Nothing is kept of a frame after it was yielded.
+
+    Args:
+        model: of `load_model`.
+        sequence: of `open_sequence`.
+        options: those of `StepOptions`: `temporal`, `track`, `attention`, `probes`, `cameras`, `command`.
+
+    Raises:
+        InputError: a frame cannot be read, a probe lies outside the BEV grid, a camera or a command is unknown, or the
+            attention of an exported file is asked for.
+    """
+    for argument, value, maker in (("model", model, "load_model"), ("sequence", sequence, "open_sequence")):
+        if isinstance(value, str | Path):
+            raise InputError(f"`{argument}={value}`: is a text or path: pass what `bevcli.{maker}` returns for it")
+    step_options, rest = spread(options, StepOptions)
+    refuse(rest, "run", StepOptions)
+    shows = step_options.attention or step_options.probes
+    runner = model.in_engine(sequence.rig, sequence, parts="attention and probes" if shows else "").runner(step_options)
+    return ((frame, prediction) for frame, prediction, _ in runner.run(sequence))

@@ -35,9 +35,8 @@ from bevcli.inference import (
 from bevcli.inference.preprocess import checked_images, image_for_rig
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
-from bevcli.inference.training_rigs import facts_notes, training_rig_notes
 from bevcli.model import AnyPrecision
-from bevcli.model.config import ModelConfig
+from bevcli.model.config import ModelConfig, facts_notes, training_rig_notes
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.temporal_model import TemporalModel, build_model
 from bevcli.options import gather

@@ -53,7 +53,7 @@ NO_BOXES = replace(Boxes3D.empty(), scores=np.zeros(0), instances=np.zeros(0, np
 
 
 class LiveSink(Protocol):
-    """A viewer that follows a recording while it is written, such as `bevcli.viewer.web.LiveView`."""
+    """A viewer that follows a recording while it is written, such as `bevcli.viewer.rerun_viewer.LiveView`."""
 
     def open(self, recording: Path) -> None:
         """Called once, when the file is there."""

@@ -19,7 +19,7 @@ from bevcli.config import load_config
 from bevcli.errors import SEVERITIES, Finding, InputError, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
-from bevcli.inference.training_rigs import training_rig_notes
+from bevcli.model.config import training_rig_notes
 from bevcli.options import defaults, gather
 from bevcli.printing import aligned, counted
 from bevcli.rig import drawings

@@ -15,7 +15,7 @@ from bevcli.errors import BevcliError, InputError
 from bevcli.parsing.files import open_regular, plain_name, run_program, run_python
 from bevcli.recording.entities import FILE_HEADER, INDEX, MESSAGE_HEADER, MESSAGE_KINDS
 from bevcli.sequences.format import drives_in, is_drive
-from bevcli.viewer.native import take_screenshot, viewer_binary, viewer_environment
+from bevcli.viewer.rerun_viewer import take_screenshot, viewer_binary, viewer_environment
 
 if TYPE_CHECKING:
     from rerun.notebook import Viewer

@@ -24,9 +24,9 @@ from bevcli.cli.stop_signals import EndSignals
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
+from bevcli.inference import run
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig

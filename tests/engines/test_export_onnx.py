@@ -16,8 +16,8 @@ from small_model import check_file, model_for_engines, small_config, small_input
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.geometry.object_classes import SHOWN_SCORE
+from bevcli.inference import run
 from bevcli.inference.load import Model, load_model
-from bevcli.inference.run import run
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.ego_motion import rotate_history

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
+from bevcli.inference import run
 from bevcli.inference.load import Model, installed_engines, load_model
-from bevcli.inference.run import run
 from bevcli.sequences.open import select_range
 from bevcli.workshop.engines import engine as module
 from bevcli.workshop.engines.engine import CachedFile, OnnxRuntimeEngine, OpenVinoEngine, RoundingOpenVinoEngine

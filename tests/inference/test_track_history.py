@@ -10,9 +10,9 @@ from interrupted import run_frames
 from memory_drive import MemoryDrive, WithoutImages
 from stepping import CPU, run
 
+from bevcli.inference import run as run_model
 from bevcli.inference.load import Model
 from bevcli.inference.preprocess import Preprocessor
-from bevcli.inference.run import run as run_model
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.config import ModelConfig

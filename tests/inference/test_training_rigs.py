@@ -14,8 +14,7 @@ from bevcli.config import load_config
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev, level_rig
 from bevcli.geometry.transforms import Array, rigid
 from bevcli.inference.runner import Runner
-from bevcli.inference.training_rigs import facts_notes, training_rig_notes, weights_facts
-from bevcli.model.config import BevFrameConfig
+from bevcli.model.config import BevFrameConfig, facts_notes, training_rig_notes, weights_facts
 from bevcli.model.temporal_model import build_model
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from memory_drive import MemoryDrive
 
+from bevcli.inference import run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.workshop.engines.export_onnx import export_onnx
 from bevcli.workshop.engines.exported import FrameDifference, check_exported, difference_lines, load_exported
 from bevcli.workshop.vad.vad import VAD

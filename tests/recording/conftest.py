@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import pytest
 
 from bevcli.workshop import meshes
-from bevcli.workshop.meshes import mesh_file
 
 
 @pytest.fixture
@@ -19,7 +18,7 @@ def in_this_process(monkeypatch):
         output = io.BytesIO()
         with monkeypatch.context() as patch:
             patch.setattr(sys, "stdout", SimpleNamespace(buffer=output))
-            error = mesh_file.write_parts(*arguments)
+            error = meshes.write_parts(*arguments)
         return subprocess.CompletedProcess(arguments, int(bool(error)), output.getvalue(), (error or "").encode())
 
     monkeypatch.setattr(meshes, "run_python", read)

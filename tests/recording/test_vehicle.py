@@ -16,8 +16,7 @@ from bevcli.recording.entities import EGO_COLOR
 from bevcli.recording.log_static import default_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop import meshes
-from bevcli.workshop.meshes import load_vehicle, mesh_file
-from bevcli.workshop.meshes.mesh_file import read_parts
+from bevcli.workshop.meshes import load_vehicle, read_parts
 
 RED = (200, 10, 20)
 
@@ -143,7 +142,7 @@ def test_a_mesh_reads_only_regular_files_of_its_folder(tmp_path, monkeypatch, na
         path.write_text("newmtl paint\nKd 1 0 0\n")
     os.mkfifo(folder / "pipe.mtl")
     (folder / "car.obj").write_text(TRIANGLE.format(name))
-    monkeypatch.setattr(mesh_file, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
+    monkeypatch.setattr(meshes, "read_bytes", lambda path, most: read.append(path.name) or read_bytes(path, most))
     ((_, _, faces, _),) = read_parts(folder / "car.obj", RED)  # a part that is missing has no colour
     assert faces.tolist() == [[0, 1, 2]]
     assert ("secret.mtl" in read, "own.mtl" in read) == (False, name == "own.mtl")

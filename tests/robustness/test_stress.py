@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import Frame
+from bevcli.inference import run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.inference.runner import Runner
 from bevcli.workshop.robustness.conditions import NAMES, choose_conditions
 from bevcli.workshop.robustness.stress import (

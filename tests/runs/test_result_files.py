@@ -18,8 +18,8 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage, FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
+from bevcli.inference import run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.inference.runner import read_commands, with_command
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.config import ModelConfig

@@ -11,8 +11,8 @@ from memory_drive import MemoryDrive, WithoutImages
 from bevcli.config import TRACKING, load_table
 from bevcli.errors import ConfigError
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.inference import run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.inference.tracking import TrackerConfig, track
 from bevcli.recording import RecordingOptions
 from bevcli.runs.run_into_folder import RunOptions, run_in_folder, run_into_folder

@@ -20,9 +20,8 @@ from bevcli.errors import WeightsError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.object_classes import ClassSettings
 from bevcli.inference.load import weights_file
-from bevcli.inference.training_rigs import facts_notes, weights_facts
 from bevcli.model.bevformer import BEVFormer
-from bevcli.model.config import ImageConfig
+from bevcli.model.config import ImageConfig, facts_notes, weights_facts
 from bevcli.model.efficientnet_lite import EfficientNetLiteConfig
 from bevcli.workshop.training.trainer import save_weights
 from bevcli.workshop.training.warm_start import WarmStart, start_backbone, warm_start

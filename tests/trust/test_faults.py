@@ -13,7 +13,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.transforms import inverse, rigid, rotation_about_z
 from bevcli.inference.load import load_model
-from bevcli.workshop.correspondence.poses import Poses
+from bevcli.workshop.formats.pose_readings import Poses
 from bevcli.workshop.synth.drives import RenderedDrives
 from bevcli.workshop.synth.rig import nuscenes_like_rig
 from bevcli.workshop.trust.camera_faults import Mistake, Points, Side, camera_findings, misfits, share

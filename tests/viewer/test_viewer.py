@@ -16,10 +16,9 @@ from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 from bevcli.errors import InputError, OutputError
 from bevcli.recording import RecordingOptions, has_av
 from bevcli.recording.writer import Recording
-from bevcli.viewer import native, web
-from bevcli.viewer.native import LOOPBACK, NO_DRIVER, free_port, start_viewer, stop, take_screenshot
+from bevcli.viewer import rerun_viewer
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.viewer.web import LiveView
+from bevcli.viewer.rerun_viewer import LOOPBACK, NO_DRIVER, LiveView, free_port, start_viewer, stop, take_screenshot
 
 VIEWS = {
     "3D scene", "BEV", "BEV features", "History weight", "Speed", "Seconds per stage", "Boxes per class", "Legend",
@@ -85,7 +84,7 @@ class AnswersUntilItDraws:
 
 def test_without_vulkan_an_early_answer_changes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("rerun.experimental.ViewerClient", AnswersUntilItDraws)
-    monkeypatch.setattr(native, "start_viewer", lambda *_: subprocess.Popen([sys.executable, "-c", ""]))
+    monkeypatch.setattr(rerun_viewer, "start_viewer", lambda *_: subprocess.Popen([sys.executable, "-c", ""]))
     with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
         take_screenshot(tmp_path / "r.rrd", tmp_path / "image.png")
 
@@ -126,8 +125,8 @@ def test_a_viewer_that_dies_or_hangs_does_not_disturb_the_run(tmp_path, monkeypa
         viewers.append(start_viewer("--headless", *arguments))
         return viewers[-1]
 
-    monkeypatch.setattr(web, "display_is_there", lambda: True)
-    monkeypatch.setattr(web, "start_viewer", start_headless)
+    monkeypatch.setattr(rerun_viewer, "display_is_there", lambda: True)
+    monkeypatch.setattr(rerun_viewer, "start_viewer", start_headless)
     drive = MemoryDrive(8)
     path = tmp_path / "recording.rrd"
     try:

@@ -24,8 +24,8 @@ from memory_drive import MemoryDrive
 from recorded_drive import record
 
 from bevcli.errors import OutputError
-from bevcli.viewer import web
-from bevcli.viewer.web import LiveView, WebViewer, web_viewer_assets
+from bevcli.viewer import rerun_viewer
+from bevcli.viewer.rerun_viewer import LiveView, WebViewer, web_viewer_assets
 
 PAGE = {"/": b"<html>viewer</html>", "/re_viewer.js": b"js", "/re_viewer_bg.wasm": b"wasm", "/favicon.ico": b""}
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -103,7 +103,7 @@ def test_addresses_and_the_name_of_this_machine_are_served(viewer, host):
 
 
 def test_silent_connections_end(viewer, monkeypatch):
-    monkeypatch.setattr(web._Handler, "timeout", 0.2)
+    monkeypatch.setattr(rerun_viewer._Handler, "timeout", 0.2)
     with socket.create_connection((viewer.host, viewer.port), timeout=5) as silent:
         assert silent.recv(1) == b""
 
@@ -138,15 +138,15 @@ def test_only_files_are_served(tmp_path, monkeypatch, make):
     with pytest.raises(OutputError, match=r"recording\.rrd: "):
         WebViewer(PAGE, tmp_path / "recording.rrd")
     (tmp_path / "served.rrd").touch()
-    monkeypatch.setattr(web, "STOP_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(rerun_viewer, "STOP_TIMEOUT_S", 0.2)
     WebViewer(PAGE, tmp_path / "served.rrd").close()  # one that never served can be closed
 
 
 @pytest.fixture
 def live_view(tmp_path, monkeypatch):
     """A live view of a recording that holds four bytes, without a viewer; and the open file."""
-    monkeypatch.setattr(web, "display_is_there", lambda: False)
-    monkeypatch.setattr(web, "web_viewer_assets", lambda: PAGE)
+    monkeypatch.setattr(rerun_viewer, "display_is_there", lambda: False)
+    monkeypatch.setattr(rerun_viewer, "web_viewer_assets", lambda: PAGE)
     view = LiveView()
     with (tmp_path / "recording.rrd").open("wb", buffering=0) as file:
         file.write(b"RRF2")

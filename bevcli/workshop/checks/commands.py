@@ -113,7 +113,7 @@ def _of_torch(name: str) -> Facts:
 
 def viewer() -> Facts:
     """The viewer, and whether it can open a window and draw for a screenshot."""
-    from bevcli.viewer.native import display_is_there, viewer_binary
+    from bevcli.viewer.rerun_viewer import display_is_there, viewer_binary
 
     binary = f"rerun {installed('rerun-sdk')}" if viewer_binary().is_file() else "the executable of rerun is missing"
     window = "in a window" if display_is_there() else "in the browser, as there is no display"

@@ -18,7 +18,7 @@ from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, rotation_about_z
 from bevcli.printing import counted
 from bevcli.sequences.open import DriveView
-from bevcli.workshop.correspondence.poses import Poses, steps_between
+from bevcli.workshop.formats.pose_readings import Poses, steps_between
 from bevcli.workshop.odometry.measure import FREEDOMS, MeasuredMotion, MeasuredStep, MeasuredSteps, measure_steps
 from bevcli.workshop.readings.stated import fitting_poses
 

@@ -18,10 +18,9 @@ from bevcli.sequences.files.ego_motion_file import ReadPoses
 from bevcli.sequences.files.readings import PoseReading, Reading, RigReading, differing, question
 from bevcli.sequences.images import ListedDrive
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.formats.calibrations import poses_in_words
 from bevcli.workshop.formats.camera_poses import on_both_sides
-from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S, in_usual_axes
+from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S, Poses, in_usual_axes
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.readings.pairs import (
     MatchedPoints,

@@ -23,8 +23,7 @@ from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
 from bevcli.inference.load import peak_memory
-from bevcli.inference.training_rigs import fov_deg, tilt_deg
-from bevcli.model.config import BevFrameConfig
+from bevcli.model.config import BevFrameConfig, fov_deg, tilt_deg
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import InputOptions

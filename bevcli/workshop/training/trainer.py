@@ -24,9 +24,8 @@ from bevcli.inference import ModelOptions, StepOptions
 from bevcli.inference.load import Model, choose_device, choose_model, load_model
 from bevcli.inference.machine import trim_memory
 from bevcli.inference.runner import Runner
-from bevcli.inference.training_rigs import weights_facts
 from bevcli.model.backbone import Backbone
-from bevcli.model.config import ModelConfig
+from bevcli.model.config import ModelConfig, weights_facts
 from bevcli.model.kernels import rounded_products
 from bevcli.model.kernels.choose import fold_batch_norms
 from bevcli.model.kernels.onednn import use_onednn

@@ -20,8 +20,8 @@ from bevcli.errors import Finding
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.images import matched, neighbours
-from bevcli.workshop.correspondence.poses import Poses
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, solve
+from bevcli.workshop.formats.pose_readings import Poses
 from bevcli.workshop.odometry.step_views import FrameView
 
 LEAST_M = 0.3  # a shorter step tells nothing

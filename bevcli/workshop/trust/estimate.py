@@ -13,8 +13,8 @@ import numpy as np
 from bevcli.frame import Drive, Frame, Prediction
 from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
+from bevcli.inference import run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.inference.runner import RunnerState
 from bevcli.printing import cell_of
 from bevcli.sequences.files.boxes_file import BoxesFile

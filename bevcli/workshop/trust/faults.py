@@ -16,12 +16,11 @@ from bevcli.errors import Finding, errors_of
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.transforms import Array
-from bevcli.inference import TORCH
+from bevcli.inference import TORCH, run
 from bevcli.inference.load import Model
-from bevcli.inference.run import run
 from bevcli.sequences.files.boxes_file import FrameBoxes
 from bevcli.sequences.open import select
-from bevcli.workshop.correspondence.poses import Poses
+from bevcli.workshop.formats.pose_readings import Poses
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.step_views import Viewer
 from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
