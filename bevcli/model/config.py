@@ -1,4 +1,7 @@
-"""The configuration that every model has: images, BEV grid, and the parts that models share."""
+"""The configuration that every model has: images, BEV grid, the parts that models share, the rigs of its training.
+
+`training_rig_notes` warns where a drive's rig is far from those.
+"""
 
 import json
 from collections.abc import Iterator, Mapping
