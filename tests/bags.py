@@ -2,13 +2,19 @@
 
 import base64
 import json
+import tempfile
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
+from rosbags.rosbag2 import StoragePlugin, Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.cameras import Camera
@@ -18,50 +24,21 @@ from bevcli.geometry.transforms import Pose
 # One message: topic, type, time in ns, fields.
 Message = tuple[str, str, int, dict[str, Any]]
 
-SEPARATOR = "\n" + "=" * 80 + "\n"
-PARTS = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
-    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
-    "geometry_msgs/Transform transform",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
-    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance",
-    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    "nav_msgs/Odometry": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    "geometry_msgs/TwistWithCovariance twist",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
-    "sensor_msgs/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
-    "uint32 step\nuint8[] data",
-    "sensor_msgs/RegionOfInterest": "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify",
-    "sensor_msgs/CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
-    "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\n"
-    "sensor_msgs/RegionOfInterest roi",
-    "sensor_msgs/NavSatStatus": "int8 status\nuint16 service",
-    "sensor_msgs/NavSatFix": "std_msgs/Header header\nsensor_msgs/NavSatStatus status\nfloat64 latitude\n"
-    "float64 longitude\nfloat64 altitude\nfloat64[9] position_covariance\nuint8 position_covariance_type",
-    "std_msgs/String": "string data",
-    "foxglove_msgs/CompressedVideo": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format",
-}
+VIDEO = "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format"
 
 
+@cache
+def store() -> Typestore:
+    """The types of messages."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    types.register(get_types_from_msg(VIDEO, "foxglove_msgs/msg/CompressedVideo"))
+    return types
+
+
+@cache
 def definition(name: str) -> str:
     """The text of a type's definition with those of all types that it contains."""
-    needed, found = [name], []
-    while needed:
-        part = needed.pop(0)
-        if part in found:
-            continue
-        found.append(part)
-        needed += [line.split("[")[0].split(" ")[0] for line in PARTS[part].split("\n") if "/" in line]
-    first, *others = found
-    return PARTS[first] + "".join(f"{SEPARATOR}MSG: {other}\n{PARTS[other]}" for other in others)
+    return store().generate_msgdef(name, ros_version=2)[0]
 
 
 def stamp(time_ns: int) -> dict[str, int]:
@@ -176,7 +153,8 @@ def write_mcap(
         schemas: dict[str, Any] = {}
         for topic, kind, time, fields in sorted(messages, key=lambda message: message[2]):
             if kind not in schemas:
-                schemas[kind] = writer.register_msgdef(kind.replace("/", "/msg/"), definition(kind))
+                name = kind.replace("/", "/msg/")
+                schemas[kind] = writer.register_msgdef(name, definition(name))
             writer.write_message(topic, schemas[kind], fields, log_time=time, publish_time=time)
         writer.finish()
     return path
@@ -184,38 +162,15 @@ def write_mcap(
 
 def write_rosbag2(folder: Path, messages: Iterator[Message] | list[Message], storage: str = "sqlite3") -> Path:
     """A rosbag2 folder with metadata.yaml and a .db3 or .mcap file."""
-    from rosbags.rosbag2 import StoragePlugin, Writer as BagWriter
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.SQLITE3 if storage == "sqlite3" else StoragePlugin.MCAP
-    with BagWriter(folder, version=9, storage_plugin=plugin) as writer:
+    with tempfile.TemporaryDirectory() as made, BagWriter(folder, version=9, storage_plugin=plugin) as writer:
         connections: dict[str, Any] = {}
-        for topic, kind, time, fields in sorted(messages, key=lambda message: message[2]):
-            name = kind.replace("/", "/msg/")
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            writer.write(connections[topic], time, store.serialize_cdr(_ros_object(store, name, fields), name))
+        with write_mcap(Path(made) / "bag.mcap", messages).open("rb") as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                if channel.topic not in connections:
+                    connections[channel.topic] = writer.add_connection(channel.topic, schema.name, typestore=store())
+                writer.write(connections[channel.topic], message.log_time, message.data)
     return folder
-
-
-def _ros_object(store: Any, name: str, fields: dict[str, Any]) -> Any:
-    """A message object of rosbags from nested dictionaries."""
-    kinds = dict(store.fielddefs[name][1])
-    return store.types[name](**{key: _ros_value(store, kinds[key], fields[key]) for key in kinds})
-
-
-def _ros_value(store: Any, kind: Any, value: Any) -> Any:
-    node, detail = int(kind[0]), kind[1]
-    if node == 2:  # a message
-        return _ros_object(store, detail, value)
-    if node in (3, 4):  # arrays
-        inner = detail[0]
-        if int(inner[0]) == 2:
-            return [_ros_object(store, inner[1], one) for one in value]
-        dtype = np.uint8 if isinstance(value, bytes) else np.float64
-        return np.frombuffer(value, dtype=dtype) if isinstance(value, bytes) else np.array(value, dtype=dtype)
-    return value
 
 
 def write_json_mcap(path: Path, messages: list[Message]) -> Path:
