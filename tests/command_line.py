@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import IO
 from unittest.mock import patch
 
+from click.testing import Result
+from typer.testing import CliRunner
+
 from bevcli.cli import main
 
 MINI_TOML = """
@@ -68,6 +71,13 @@ def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
             code = end.code or 0
         texts = [flushed(file) for file in (out, err)]
     return subprocess.CompletedProcess(arguments, code, *texts)
+
+
+def invoked(*arguments: object, code: int = 0) -> Result:
+    """`bevcli …` as a function call that ends with an exit code; the errors that the program prints are raised."""
+    result = CliRunner().invoke(main.app, [*map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == code, result.output
+    return result
 
 
 def flushed(file: IO[str]) -> str:

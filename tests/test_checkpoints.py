@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+from command_line import invoked
 from memory_drive import make_rig
 from small_model import small_model
-from typer.testing import CliRunner
 
 from bevcli.checkpoints import (
     bundled_weights,
@@ -23,7 +23,6 @@ from bevcli.checkpoints import (
     read_checkpoint,
     require_fit,
 )
-from bevcli.cli.main import app
 from bevcli.config import known_models, load_config
 from bevcli.errors import OutputError, WeightsError
 from bevcli.geometry.bev_grid import BevGrid
@@ -110,8 +109,8 @@ def test_other_differences_of_v2_files_are_refused(tmp_path: Path) -> None:
 def test_weights_inspect_names_objects_that_were_not_read(tmp_path: Path) -> None:
     path = tmp_path / "small.pth"
     torch.save({"state_dict": small_model().state_dict(), "meta": {"date": datetime.datetime(2022, 8, 16)}}, path)
-    answer = CliRunner().invoke(app, ["weights", "inspect", str(path)], catch_exceptions=False)
-    assert "not read        datetime.datetime (objects that are no weights" in answer.stdout
+    shown = invoked("weights", "inspect", path).stdout
+    assert "not read        datetime.datetime (objects that are no weights" in shown
     assert read_checkpoint(path).not_read == ("datetime.datetime",)
 
 
@@ -198,17 +197,20 @@ def test_a_model_file_for_other_classes_takes_the_weights(demo_state: dict, tmp_
         load_model(weights=path)
     with pytest.raises(WeightsError, match="does not fit model demo: 7 classes instead of 10; "):
         load_model("demo", weights=path)
-    command = ["weights", "model-file", str(path), str(out)]
-    refused = str(CliRunner().invoke(app, command).exception)
-    assert "has 7 classes: pass their names in the order of the training as `classes` (`--classes NAME," in refused
+    command = ["weights", "model-file", path, out]
     names = "car,truck,forklift,bus,trailer,barrier,motorcycle"
-    answer = CliRunner().invoke(app, [*command, "--classes", names], catch_exceptions=False)
-    assert f"{out}: demo with 7 classes: car, truck, forklift, " in answer.stdout
+    with pytest.raises(
+        WeightsError, match=r"has 7 classes: pass their names in the order of the training as `classes`"
+    ):
+        invoked(*command)
+    shown = invoked(*command, "--classes", names).stdout
+    assert f"{out}: demo with 7 classes: car, truck, forklift, " in shown
     model = load_model(out, weights=path)
     assert model.name == "my"
     assert ",".join(model.config.classes) == names
     assert model.config.backbone == load_config("demo").backbone
-    assert "already exists" in str(CliRunner().invoke(app, [*command, "--classes", names]).exception)
+    with pytest.raises(OutputError, match="already exists"):
+        invoked(*command, "--classes", names)
     safetensors.torch.save_file(of_seven_classes(demo_state) | {"my.loss": torch.zeros(2)}, path)
     with pytest.raises(WeightsError, match=r"differs from demo, .* in more than classes: .*too many: my\.loss"):
         model_file_for(path, tmp_path / "other.toml")
@@ -262,7 +264,6 @@ def test_every_missing_unexpected_and_misshapen_key_is_listed(tmp_path: Path) ->
     assert f"2 missing: {gone[0]}, {gone[1]}" in message
     assert "2 unexpected: one.more, two.more" in message
     assert "1 misshapen: bev_queries.embedding: expected (48, 32), found (5, 32)" in message
-    assert "\n" not in message
 
 
 def test_weights_of_another_model_are_refused_and_named(official_tiny: Path) -> None:
@@ -294,7 +295,6 @@ def test_a_file_that_does_not_contain_weights_is_an_error(tmp_path: Path, suffix
     with pytest.raises(WeightsError) as caught:
         read_checkpoint(path)
     assert f"file{suffix}: " in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_code_in_a_file_is_an_error_and_does_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -343,8 +343,7 @@ def test_the_parts_of_base_have_the_published_sizes() -> None:
 
 
 def test_weights_inspect_lists_the_parts_of_a_model() -> None:
-    answer = CliRunner().invoke(app, ["weights", "inspect", "--model", "tiny"], catch_exceptions=False)
-    lines = answer.stdout.splitlines()
+    lines = invoked("weights", "inspect", "--model", "tiny").stdout.splitlines()
     assert any(line.startswith("BEV queries ") and "640,000  2500 × 256" in line for line in lines)
     end = lines[0].index("  shapes")  # of the column "parameters", which is aligned to the right
     total = sum(int(line[:end].split()[-1].replace(",", "")) for line in lines[1:-1])
@@ -352,13 +351,12 @@ def test_weights_inspect_lists_the_parts_of_a_model() -> None:
 
 
 def test_weights_inspect_gives_file_and_parts_as_json(official_tiny: Path) -> None:
-    command = ["weights", "inspect", str(official_tiny), "--model", "tiny", "--json"]
-    data = json.loads(CliRunner().invoke(app, command, catch_exceptions=False).stdout)
+    data = json.loads(invoked("weights", "inspect", official_tiny, "--model", "tiny", "--json").stdout)
     assert (data["models"], data["model"]) == (["tiny"], "tiny")
     assert data["file_bytes"] == official_tiny.stat().st_size
     assert data["model_parameters"] == sum(part["parameters"] for part in data["parts"]) < data["parameters"]
     queries = {"name": "BEV queries", "modules": ["bev_queries.embedding"]}
     assert {**queries, "parameters": 640_000, "shapes": [[2500, 256]]} in data["parts"]
-    refused = CliRunner().invoke(app, ["weights", "inspect", str(official_tiny), "--model", "base"]).exception
-    assert "does not fit model base: it holds weights of tiny; " in str(refused)
-    assert CliRunner().invoke(app, ["weights", "inspect"]).exit_code == 2
+    with pytest.raises(WeightsError, match="does not fit model base: it holds weights of tiny; "):
+        invoked("weights", "inspect", official_tiny, "--model", "base")
+    invoked("weights", "inspect", code=2)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner
+from command_line import invoked
 
-from bevcli.cli.main import app
 from bevcli.config import load_config
+from bevcli.errors import BevcliError
 from bevcli.inference.load import installed_engines
 from bevcli.workshop.benchmark import measure, versions
 from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits, count_operations
@@ -85,8 +85,7 @@ def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
     monkeypatch.setattr(measure, "RUN_FRAMES", 4)
     monkeypatch.setattr(measure, "CPU_EDGE", 256)
     monkeypatch.setattr(measure, "COPIED_FLOATS", 1 << 20)
-    arguments = ["bench", "--model", str(small_model_file), "--count", "1", "--against", "plain", "--json"]
-    answer = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    answer = invoked("bench", "--model", small_model_file, "--count", 1, "--against", "plain", "--json")
     data = json.loads(answer.stdout)
     assert set(data) >= {
         "model", "device", "precision", "stages_ms", "frame_ms", "run_over_model", "fps", "peak_memory_mb",
@@ -107,22 +106,21 @@ def test_json_of_a_whole_benchmark(small_model_file, monkeypatch):
 @pytest.mark.slow
 def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     profile = tmp_path / "profile.json"
-    options = ["--precision", "bf16", "--count", "1", "--profile", str(profile)]
-    answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
+    options = ["--precision", "bf16", "--count", 1, "--profile", profile]
+    answer = invoked("bench", "--model", small_model_file, *options)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
 
 
 def test_engines_are_compared_as_they_are():
-    answer = CliRunner().invoke(app, ["bench", "--engines", "--precision", "int8"])
-    assert "--engines compares all of them" in str(answer.exception)
+    with pytest.raises(BevcliError, match="--engines compares all of them"):
+        invoked("bench", "--engines", "--precision", "int8")
 
 
 @pytest.mark.slow
 def test_engines_are_timed_side_by_side(small_model_file, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    done = CliRunner().invoke(app, ["bench", "--engines", "--model", str(small_model_file), "--count", "2", "--json"])
-    assert done.exit_code == 0, done.output
+    done = invoked("bench", "--engines", "--model", small_model_file, "--count", 2, "--json")
     rows = {(row["engine"], row["precision"]): row for row in json.loads(done.stdout)["engines"]}
     assert {engine for engine, _ in rows} == {"torch", *installed_engines()}
     assert rows["torch", "fp32"]["largest_m"] == 0
@@ -139,8 +137,7 @@ def test_engines_are_timed_side_by_side(small_model_file, tmp_path, monkeypatch)
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU")
 def test_on_a_gpu_the_stages_add_up_to_the_frame(small_model_file):
-    options = ["--device", "cuda", "--against", "plain", "--json"]
-    answer = CliRunner().invoke(app, ["bench", "--model", str(small_model_file), *options], catch_exceptions=False)
+    answer = invoked("bench", "--model", small_model_file, "--device", "cuda", "--against", "plain", "--json")
     data = json.loads(answer.stdout)
     inside = set(data["stages_ms"]) - {"decode", "preprocess", "recording"}
     assert sum(data["stages_ms"][stage] for stage in inside) <= 1.2 * max(data["frame_ms_spread"])

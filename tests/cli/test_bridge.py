@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import pytest
 import torch
 import typer
+from command_line import invoked
 from typer.testing import CliRunner
 
 from bevcli.cli.bridge import command
@@ -139,8 +140,6 @@ def test_a_numbered_gpu_that_is_not_there_is_an_error():
 
 def test_the_sample_drive_is_copied_once(tmp_path):
     for words in ("copied", "exists already"):
-        result = CliRunner().invoke(app, ["samples", "--out", str(tmp_path / "samples")])
-        assert result.exit_code == 0
-        assert words in result.output
+        assert words in invoked("samples", "--out", tmp_path / "samples").output
     assert len(open_sequence(tmp_path / "samples/street").stamps) == 20
     assert json.loads((tmp_path / "samples/first_steps.ipynb").read_text())["cells"]

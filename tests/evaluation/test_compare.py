@@ -11,14 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import invoked
 from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
 from sequences.nuscenes_tables import Size, write_tables
 from test_eval_command import evaluated, write_frames
-from typer.testing import CliRunner
 
 import bevcli
-from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -103,7 +102,7 @@ def test_the_command_prints_what_compare_returns(files: tuple[Path, Path, Path])
     comparison = bevcli.compare(*files, max_range=20.0, worst=2)
     options = ["--max-range", "20", "--worst", "2"]
     assert evaluated(*files, *options) == comparison.to_dict()
-    shown = CliRunner().invoke(app, ["eval", *map(str, files), *options], catch_exceptions=False)
+    shown = invoked("eval", *files, *options)
     assert shown.stdout == comparison.table() + "\n"
     assert f"B: {files[1]}" in shown.stdout
     assert "note: the intervals are too narrow for 5 frames" in shown.stderr
@@ -261,7 +260,7 @@ def test_what_cannot_be_compared_is_named(files: tuple[Path, Path, Path], change
 
 def test_a_third_file_and_models_without_a_common_frame_are_refused(files: tuple[Path, Path, Path]) -> None:
     with pytest.raises(InputError, match=r"found 3 files of predictions .expected 1, or 2 to compare"):
-        CliRunner().invoke(app, ["eval", *map(str, (*files[:2], *files[1:]))], catch_exceptions=False)
+        invoked("eval", *files[:2], *files[1:])
     for place, file in enumerate(files[:2]):
         content = json.loads(file.read_text())
         file.write_text(json.dumps(content | {"frames": content["frames"][2 * place : 2 * place + 2]}))
@@ -278,7 +277,7 @@ def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, 
     write_frames(tmp_path / "other.json", [cars([5.0], [0.9])] * 4)
     monkeypatch.chdir(tmp_path)
     both, one = re.findall("^bevcli eval .*$", page, flags=re.MULTILINE)
-    shown = CliRunner().invoke(app, shlex.split(both, comments=True)[1:], catch_exceptions=False)
+    shown = invoked(*shlex.split(both, comments=True)[1:])
     [view] = re.findall("^Look at it: .*--frame ", page, flags=re.MULTILINE)
     for text in (view, "better\n", "A missed  A invented  B missed  B invented\n"):
         assert text in page
@@ -290,12 +289,12 @@ def test_the_commands_of_the_page_run(tmp_path: Path, drive: Path, found: Path, 
         *(f"misses_and_false_alarms_{model}.png" for model in "AB"),
     }
     alone = both.replace("--plot plots", "--plot curves.svg")
-    CliRunner().invoke(app, shlex.split(alone, comments=True)[1:], catch_exceptions=False)
+    invoked(*shlex.split(alone, comments=True)[1:])
     assert "<svg" in Path("curves.svg").read_text()[:1000]
     image = cv2.imread("plots/precision_recall_of_both.png")
     assert image is not None
     blue, red = image[..., 0].astype(int), image[..., 2].astype(int)
     assert (blue - red > 60).sum() > 500  # the curves of A
     assert (red - blue > 60).sum() > 500
-    shown = CliRunner().invoke(app, shlex.split(one, comments=True)[1:], catch_exceptions=False)
+    shown = invoked(*shlex.split(one, comments=True)[1:])
     assert "worst frames" in shown.stdout

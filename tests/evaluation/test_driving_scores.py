@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoked
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp, Ground
 from bevcli.geometry.boxes import Boxes3D
@@ -79,10 +78,7 @@ def scored(
 ) -> dict[str, Any]:
     found = write(tmp_path / "found", boxes, plan, line, ("predictions.json", "map_lines.json"))
     truth = write(tmp_path / "truth", car, plan, LINE, ("ground_truth.json", "ground_truth_lines.json"))
-    options = ["--map", "--motion", "--plan", "--json"]
-    result = CliRunner().invoke(app, ["eval", str(found), str(truth), *options], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(invoked("eval", found, truth, "--map", "--motion", "--plan", "--json").stdout)
 
 
 def test_perfect_predictions_have_perfect_scores(tmp_path: Path) -> None:

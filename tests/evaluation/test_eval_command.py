@@ -8,11 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import invoked
 from made_boxes import made_boxes
 from random_boxes import as_predictions, random_truth
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.frame import BevMap, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -38,9 +37,7 @@ def scored(folder: Path, found: list[Boxes3D], truth: list[Boxes3D]) -> dict[str
 
 
 def evaluated(*arguments: Path | str) -> dict[str, Any]:
-    result = CliRunner().invoke(app, ["eval", *map(str, arguments), "--json"], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(invoked("eval", *arguments, "--json").stdout)
 
 
 @pytest.fixture
@@ -208,7 +205,7 @@ def test_a_nuscenes_root_and_its_conversion_have_the_same_scores(shared: Path, t
 def test_the_command_prints_what_the_library_returns(files: tuple[Path, Path]) -> None:
     scores = evaluate(*files, max_range=20.0)
     assert evaluated(*files, "--max-range", "20") == scores.to_dict()
-    result = CliRunner().invoke(app, ["eval", *map(str, files), "--max-range", "20"], catch_exceptions=False)
+    result = invoked("eval", *files, "--max-range", 20)
     assert result.stdout == scores.table() + "\n"
     assert max(map(len, result.stdout.splitlines())) <= 115
 
@@ -245,7 +242,7 @@ def test_tracks_are_scored_when_asked_for(tracked_files: tuple[Path, Path]) -> N
     }  # fmt: skip
     assert (tracking["scenes"], tracking["frames"]) == (1, 5)
     assert tracking["recall"] == 1
-    result = CliRunner().invoke(app, ["eval", *map(str, tracked_files), "--tracking"], catch_exceptions=False)
+    result = invoked("eval", *tracked_files, "--tracking")
     for name in ("AMOTA", "AMOTP", "MOTA", "IDS", "FRAG", "TID", "LGD", "identity switches"):
         assert name in result.stdout
 

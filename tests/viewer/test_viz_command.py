@@ -9,11 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from command_line import invoked
 from memory_drive import MemoryDrive, make_camera
 from recorded_drive import bev_from_world, boxes_ahead, record
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import InputError, OutputError
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
@@ -31,9 +30,7 @@ def drive(tmp_path_factory):
 
 
 def viz(*arguments) -> str:
-    result = CliRunner().invoke(app, ["viz", *map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+    return invoked("viz", *arguments).output
 
 
 def test_the_summary_counts_frames_boxes_and_bytes(drive):
@@ -46,8 +43,7 @@ def test_the_summary_counts_frames_boxes_and_bytes(drive):
 
 def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
     frames, path = drive
-    result = CliRunner().invoke(app, ["export", str(path), "--format", "csv", "--out", str(tmp_path / "boxes.csv")])
-    assert result.exit_code == 0, result.output
+    invoked("export", path, "--format", "csv", "--out", tmp_path / "boxes.csv")
     with (tmp_path / "boxes.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
@@ -62,9 +58,7 @@ def test_the_table_has_the_shown_boxes_in_the_world_frame(drive, tmp_path):
 
 def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
     frames, path = drive
-    arguments = ["export", str(path), "--format", "json", "--out", str(tmp_path / "boxes.json")]
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    invoked("export", path, "--format", "json", "--out", tmp_path / "boxes.json")
     content = json.loads((tmp_path / "boxes.json").read_text())
     assert (content["format"], content["frame_of_reference"]) == ("bevcli-boxes/1", "world")
     assert [frame["timestamp_ns"] for frame in content["frames"]] == [frame.stamp.timestamp_ns for frame in frames]
@@ -131,7 +125,7 @@ def test_folders_and_cut_recordings_are_shown_and_wrong_requests_told(drive, tmp
     assert viz(cut, "--summary").startswith(f"note: {cut} is incomplete")
     with pytest.raises(InputError, match="must end in"):
         viz(path, "--video", tmp_path / "x.avi")
-    assert CliRunner().invoke(app, ["viz", str(path), "--frame", "1", "--summary"]).exit_code == 2
+    invoked("viz", path, "--frame", 1, "--summary", code=2)
     assert viz(path.parent, "--summary") == viz(path, "--summary")
     with pytest.raises(InputError, match=r"the folder has no recording\.rrd"):
         viz(tmp_path, "--summary")
@@ -154,4 +148,4 @@ def test_a_video_of_the_images_has_them_and_their_boxes_alone(tmp_path):
     assert (canvas[:, 201:521][drawn] == (44, 158, 255)).all(-1).any()  # the car's orange, BGR
     assert drawn.mean() < 0.1
     assert not drawn[150:].any()
-    assert "only valid with --video" in CliRunner().invoke(app, ["viz", str(path), "--view", "images"]).output
+    assert "only valid with --video" in invoked("viz", path, "--view", "images", code=2).output

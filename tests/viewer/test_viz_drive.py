@@ -11,13 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import command
+from command_line import command, invoked
 from recorded_drive import screenshot_or_skip
-from typer.testing import CliRunner
 
 import bevcli
 from bevcli.cli import viewing
-from bevcli.cli.main import app
 from bevcli.errors import InputError
 from bevcli.recording import entities
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
@@ -63,9 +61,7 @@ def opened(monkeypatch):
 def viz(folder, line):
     """Raises the errors that the program prints."""
     with contextlib.chdir(folder):
-        result = CliRunner().invoke(app, ["viz", *shlex.split(line)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+        return invoked("viz", *shlex.split(line)).output
 
 
 def test_boxes_are_recorded_against_the_labels(folder):
