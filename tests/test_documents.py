@@ -11,12 +11,10 @@ import shlex
 import subprocess
 import sys
 from functools import cache
-from html.parser import HTMLParser
 from pathlib import Path
 from runpy import run_path
 from textwrap import dedent
 from typing import Any
-from urllib.parse import unquote
 
 import pytest
 import typer
@@ -148,8 +146,8 @@ def test_the_first_page_leads_to_the_newest_version(tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "README.html").touch()
     write_pages(tmp_path)
-    assert Links(tmp_path / "index.html").links == ["0.10.0/README.html"]
-    assert Links(tmp_path / "versions.html").links == [f"{name}/README.html" for name in ("0.10.0", "0.9.1", "0.2.0")]
+    links = [re.findall(r'href="(.*?)"', (tmp_path / f"{page}.html").read_text()) for page in ("index", "versions")]
+    assert links == [["0.10.0/README.html"], [f"{name}/README.html" for name in ("0.10.0", "0.9.1", "0.2.0")]]
 
 
 def test_reference_names_every_public_name():
@@ -162,23 +160,6 @@ def test_reference_names_every_public_name():
         bevcli.no_such_name  # noqa: B018
 
 
-class Links(HTMLParser):
-    """Links and anchors of a page."""
-
-    def __init__(self, page: Path) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.anchors: set[str] = set()
-        self.feed(page.read_text())
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
-        self.anchors |= {given.get("id") or "", given.get("name") or ""}
-        link = given.get("href" if tag in ("a", "link") else "src")
-        if link and not re.match(r"\w+:|//", link):
-            self.links.append(unquote(link))
-
-
 PAGE = (ROOT / "docs" / "python.md").read_text()
 EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
 
@@ -189,12 +170,6 @@ def test_the_examples_run(clone: Path, capsys: pytest.CaptureFixture[str]) -> No
     with contextlib.chdir(clone):
         exec("\n".join(EXAMPLES), {})
     assert "is missing (expected" in capsys.readouterr().out
-
-
-def test_importing_bevcli_loads_nothing_heavy():
-    heavy = ("torch", "numpy", "cv2", "rerun", "scipy", "numba")
-    code = f"import sys, bevcli; print([module for module in {heavy} if module in sys.modules])"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
 
 
 PYTHON_BLOCKS = re.compile(r"^```python\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)

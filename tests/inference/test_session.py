@@ -55,16 +55,6 @@ def test_a_session_equals_a_run_to_the_byte(model, temporal):
         assert_same(step(session, frame), expected)
 
 
-@pytest.mark.slow
-def test_a_session_equals_a_run_on_the_sample_drive():
-    model, drive = bevcli.load_model("demo"), bevcli.open_sequence("samples/street", frames=slice(0, 2))
-    session = bevcli.Session(model, drive.rig)
-    for frame, expected in bevcli.run(model, drive):
-        found = step(session, frame)
-        assert_same(found, expected)
-        assert found.segmentation.cells.tobytes() == expected.segmentation.cells.tobytes()
-
-
 def test_rgb_images_are_those_of_the_other_order(model):
     drive = MemoryDrive(1)
     frame, expected = next(bevcli.run(model, drive))

@@ -14,11 +14,10 @@ from bevcli.workshop.formats.markup import parse_xml, read_yaml
 
 
 def refused(function, *arguments, error=InputError, **options):
-    """The message; it names the file and has one line."""
+    """The message; it names the file."""
     began = time.process_time()
     with pytest.raises(error) as caught:
         function(*arguments, **options)
-    assert "\n" not in str(caught.value)
     assert "file" in str(caught.value)
     assert time.process_time() - began < 5
     return str(caught.value)

@@ -200,9 +200,8 @@ def test_sparse_and_meta_tensors_and_integer_keys_are_errors(tmp_path: Path) -> 
         if len(state) == 2:  # a key that is no text is left out
             assert list(read_checkpoint(path).state) == ["a"]
             continue
-        with pytest.raises(WeightsError) as caught:
+        with pytest.raises(WeightsError):
             read_checkpoint(path)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("dtype", [torch.int8, torch.int64, torch.complex64, torch.bool])

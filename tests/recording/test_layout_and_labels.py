@@ -51,6 +51,7 @@ def image_sizes(rig):
 def test_all_images_of_a_rig_are_equally_large(rig):
     sizes = np.array(list(image_sizes(make_rig(RIGS[rig])).values()))
     assert sizes.min(axis=0) == pytest.approx(sizes.max(axis=0))
+    assert 0.1 < sum(camera_row_shares(make_rig(RIGS[rig]))) < 0.7  # the middle keeps room
     assert sizes[0, 0] > 0.98 * min(WINDOW[0] * (1 - TEXTS_SHARE) / max(map(len, rows_by_yaw(RIGS[rig]))), 480)
 
 

@@ -5,17 +5,16 @@ from dataclasses import dataclass, fields, replace
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemoryDrive, make_camera, make_rig
+from memory_drive import MemoryDrive, make_rig
 from recorded_drive import GRID, TINY, NamedModel, predict, record
 
 from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
 from bevcli.geometry.bev_grid import BevGrid
-from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
 from bevcli.recording import RecordingOptions, entities
-from bevcli.recording.blueprint import TEXTS_SHARE, TITLE_HEIGHT, WINDOW, camera_row_shares, frame_rate_hz
+from bevcli.recording.blueprint import frame_rate_hz
 from bevcli.recording.entities import (
     BACKGROUND,
     GROUND_TRUTH_COLOR,
@@ -80,21 +79,6 @@ def test_range_rings_end_with_the_grid():
     assert ring_distances_m(BevGrid(64, 64, (-32.0, 32.0), (-32.0, 32.0))) == [10, 20, 30]
     assert ring_distances_m(BevGrid(64, 64, (-51.2, 51.2), (-51.2, 51.2))) == [10, 20, 30, 40, 50]
     assert ring_distances_m(BevGrid(64, 64, (-30.0, 30.0), (-15.0, 45.0))) == [10]
-
-
-@pytest.mark.parametrize("size", [(1600, 900), (1920, 1208), (1280, 720)])
-def test_images_of_six_cameras_fill_most_of_their_views(size):
-    cameras = tuple(make_camera(c.name, np.degrees(c.yaw), *size) for c in make_rig().cameras)
-    shares = camera_row_shares(CameraRig(cameras, default_ego_from_bev()))
-    view = WINDOW[0] * (1 - TEXTS_SHARE) / 3, shares[0] * WINDOW[1] - TITLE_HEIGHT
-    scale = min(view[0] / size[0], view[1] / size[1])
-    assert size[0] * size[1] * scale**2 > 0.85 * view[0] * view[1]
-    assert sum(shares) < 0.7
-
-
-@pytest.mark.parametrize("yaws", [{"only": 0}, {"front": 0, "back": 180}, {f"c{i}": 20 * i - 60 for i in range(7)}])
-def test_the_middle_keeps_room_with_any_rig(yaws):
-    assert 0.1 < sum(camera_row_shares(make_rig(yaws))) < 0.7
 
 
 @dataclass(frozen=True)

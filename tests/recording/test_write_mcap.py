@@ -119,19 +119,6 @@ def test_the_reader_of_bags_gives_the_same_frames(file):
             assert a.rig[name].distortion == b.rig[name].distortion
 
 
-def test_an_interrupted_file_gets_no_name(tmp_path):
-    drive = Truthful()
-
-    def write() -> None:
-        with open_writer(tmp_path / "a.mcap", drive, WriteOptions("mcap")) as writer:
-            writer.write(drive.load(0))
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_existing_files_and_boxes_of_another_drive_are_refused(file, tmp_path):
     with pytest.raises(OutputError, match="exists already: choose another file, or pass `force=True`"):
         open_writer(file, Truthful(), WriteOptions("mcap"))

@@ -35,21 +35,15 @@ from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.map_lines import LinesWriter, MapLines, read_lines
 from bevcli.workshop.live import Session
 from bevcli.workshop.vad.plan import Plan, read_plans
-from bevcli.workshop.vad.vad import VAD, LineDecoderConfig, MotionConfig, VADConfig
+from bevcli.workshop.vad.vad import VAD
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 FRAMES = 3
-MOTION = MotionConfig(modes=2, steps=3, step_s=0.5, attention_heads=4, feed_forward_width=32)
-LINES = LineDecoderConfig(
-    lines=6, line_points=5, layers=1, attention_heads=4, feed_forward_width=32, max_lines=4, classes=("divider", "kerb")
-)
 
 
 @pytest.fixture(scope="module")
-def model(mini_config: ModelConfig) -> Model:
-    settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
-    torch.manual_seed(0)
-    return Model(VAD(VADConfig(**settings | {"name": "mini-vad"}, line_decoder=LINES, motion=MOTION)).eval())
+def model(mini_vad: VAD) -> Model:
+    return Model(mini_vad)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +62,11 @@ def out(model: Model, options: RunOptions, tmp_path_factory: pytest.TempPathFact
 
 def test_files_hold_the_results_on_the_ground(model: Model, out: Path) -> None:
     lines, plans = read_lines(out / "map_lines.json"), read_plans(out / "plan.csv")
-    assert (lines.frame_of_reference, lines.classes, len(plans)) == ("world", ("divider", "kerb"), FRAMES)
+    assert (lines.frame_of_reference, lines.classes, len(plans)) == (
+        "world",
+        ("divider", "ped_crossing", "boundary"),
+        FRAMES,
+    )
     assert [planned.plan.command for planned in plans] == ["straight", "left", "left"]  # it stays until the next one
     files = lines.frames, plans, read_boxes(out / "predictions.json").frames
     for (frame, prediction), of_frame, planned, boxes in zip(run(model, MemoryDrive(FRAMES)), *files, strict=True):

@@ -114,9 +114,8 @@ def test_a_state_with_one_changed_byte_is_refused(tmp_path):
         broken = bytearray(whole)
         broken[place] ^= 1
         (tmp_path / "state").write_bytes(broken)
-        with pytest.raises(InputError) as error:
+        with pytest.raises(InputError):
             load_state(tmp_path / "state", BevHistory)
-        assert "\n" not in str(error.value)
 
 
 def test_a_failed_write_keeps_the_state_before(tmp_path, monkeypatch):

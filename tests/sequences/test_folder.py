@@ -89,20 +89,6 @@ def test_without_ego_motion_every_pose_is_the_identity(drive):
         np.testing.assert_array_equal(sequence.load(3).kinematics.acceleration, [0, 0, 9.81])
 
 
-def test_images_named_by_timestamp_need_no_frames_csv(drive):
-    table = open_sequence(drive)
-    last = table.load(3).images["CAM_BACK"].pixels_bgr
-    for camera in ("CAM_FRONT", "CAM_BACK"):
-        for number, stamp in enumerate(table.stamps):
-            path = drive / "images" / camera / f"{number}.png"
-            path.rename(path.with_name(f"{10**14 + stamp.timestamp_ns}.png"))
-    (drive / "frames.csv").unlink()
-    sequence = open_sequence(drive, ego_motion="static")
-    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [10**14 + s.timestamp_ns for s in table.stamps]
-    assert [stamp.index for stamp in sequence.stamps] == [0, 1, 2, 3]
-    np.testing.assert_array_equal(sequence.load(3).images["CAM_BACK"].pixels_bgr, last)
-
-
 def test_numbered_images_take_their_times_from_timing_toml(drive):
     table = open_sequence(drive)
     (drive / "frames.csv").unlink()

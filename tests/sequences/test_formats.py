@@ -5,40 +5,26 @@ import shutil
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
-from memory_drive import make_camera
 
 from bevcli import registry
 from bevcli.errors import BevcliError, InputError
-from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
-from bevcli.sequences.files.calibration_file import write_calibration
 from bevcli.sequences.format import GROUP, format_of, formats
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 
-PLUG_IN = '''
-from pathlib import Path
+PLUG_IN = """
+from memory_drive import MemoryDrive
 
-import cv2
-import numpy as np
-
-from bevcli.errors import BevcliError, InputError
-from bevcli.frame import CameraImage, Frame, FrameStamp, Sequence
-from bevcli.geometry.transforms import Pose
 from bevcli.options import option, options
-from bevcli.sequences.files.calibration_file import draft_of
 from bevcli.sequences.format import Format
-from bevcli.sequences.images import AT_REST
-from bevcli.sequences.native import FolderOptions
-from bevcli.sequences.options import RigOptions
 
 
 @options("Input")
-class Strips(RigOptions, Format):
+class Strips(Format):
     name = "a strip"
     expected = "name.strip"
     images_per_second: float = option(default=2.0, help="Strips: images per second.")
@@ -48,28 +34,8 @@ class Strips(RigOptions, Format):
         return path.suffix == ".strip"
 
     def open(self, path, common):
-        return Strip(path, self)
-
-
-class Strip(Sequence):
-    """A file name.strip: one camera's images below each other, in a PNG. The calibration is given with it."""
-
-    has_ego_motion = False
-
-    def __init__(self, path, own):
-        draft = draft_of(own)
-        if draft is None:
-            raise InputError(f"{path}: states no calibration: pass `calibration`")
-        self.name, self.rig = path.stem, draft.rig
-        pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
-        self.images = np.split(pixels, len(pixels) // self.rig.cameras[0].height)
-        self.stamps = tuple(FrameStamp(i, "", int(i * 1e9 / own.images_per_second)) for i in range(len(self.images)))
-
-    def load(self, place):
-        stamp, (camera,) = self.stamps[place], self.rig.names
-        images = {camera: CameraImage(stamp.timestamp_ns, self.images[place])}
-        return Frame(stamp, self.rig, images, Pose.identity(), {camera: Pose.identity()}, AT_REST)
-'''
+        return MemoryDrive(3, step_s=1 / self.images_per_second)
+"""
 
 
 @pytest.fixture
@@ -94,13 +60,9 @@ def plug_in(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def strip(tmp_path, drive) -> dict:
-    """Three images of 6 x 4 pixels below each other, and the calibration of their camera."""
-    pixels = np.repeat(np.array([10, 20, 30], dtype=np.uint8), 4)[:, None, None] * np.ones((1, 6, 3), dtype=np.uint8)
-    (tmp_path / "day.strip").write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-    rig = CameraRig((make_camera("CAM_FRONT", 0, 6, 4),), default_ego_from_bev())
-    write_calibration(tmp_path / "calibration.json", rig)
-    return {"path": tmp_path / "day.strip", "calibration": tmp_path / "calibration.json"}
+def strip(tmp_path) -> Path:
+    (tmp_path / "day.strip").touch()
+    return tmp_path / "day.strip"
 
 
 def test_each_option_is_stated_once():
@@ -140,10 +102,8 @@ def test_the_strongest_format_is_taken(drive, tmp_path):
 
 
 def test_a_package_can_add_a_format(plug_in, strip, drive):
-    assert len([line for line in PLUG_IN.splitlines() if line]) <= 45
-    sequence = open_sequence(**strip, images_per_second=4, frames=slice(1, None))
-    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [250_000_000, 500_000_000]
-    assert [int(sequence.load(place).images["CAM_FRONT"].pixels_bgr[0, 0, 0]) for place in (0, 1)] == [20, 30]
+    sequence = open_sequence(strip, images_per_second=4, frames=slice(1, None))
+    assert [stamp.timestamp_ns - 10**18 for stamp in sequence.stamps] == [250_000_000, 500_000_000]
     with pytest.raises(InputError, match=r"images.per.second"):
         open_sequence(drive, images_per_second=4)
     with pytest.raises(InputError, match=r"a sequence folder, .*, a strip"):
@@ -151,12 +111,11 @@ def test_a_package_can_add_a_format(plug_in, strip, drive):
 
 
 def test_a_broken_package_stops_only_what_needs_its_format(plug_in, strip, drive):
-    (strip["path"].parent / "site/strips.py").write_text("import a_package_that_is_missing")
+    (strip.parent / "site/strips.py").write_text("import a_package_that_is_missing")
     assert open_sequence(drive).stamps
-    for path, options in ((strip["path"], {}), (drive, {"images_per_second": 4})):
-        with pytest.raises(BevcliError, match=r"strips = strips:Strips cannot be imported.*a_package") as error:
+    for path, options in ((strip, {}), (drive, {"images_per_second": 4})):
+        with pytest.raises(BevcliError, match=r"strips = strips:Strips cannot be imported.*a_package"):
             open_sequence(path, **options)
-        assert "\n" not in str(error.value)
     assert len(formats()) == len(registry.entries(GROUP)) - 1
 
 

@@ -129,7 +129,6 @@ def read(folder, intrinsics, name):
 def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
     with pytest.raises(InputError, match=expected) as caught:
         read_rig(*write(tmp_path, text, poses))
-    assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
     intrinsics, extrinsics = write(tmp_path, KALIBR, {})
     with pytest.raises(InputError, match=r"cam0: its pose .* is missing"):

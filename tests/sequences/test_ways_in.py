@@ -2,9 +2,7 @@
 
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from memory_drive import MemoryDrive
@@ -12,7 +10,6 @@ from memory_drive import MemoryDrive
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import wrap_angle
 from bevcli.sequences.files.boxes_file import count_classes
-from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import WriteOptions
 from bevcli.workshop.formats.convert import open_writer, truth_left_out
@@ -49,22 +46,6 @@ def assert_same_frames(one, other, *, same_bytes: bool) -> None:
         assert a.ground_truth.classes.tolist() == b.ground_truth.classes.tolist()
 
 
-def copy_without_images(source: Path, target: Path) -> None:
-    target.mkdir()
-    for name in ("calibration.json", "ego_motion.csv", "frames.csv", "ground_truth.json"):
-        (target / name).write_bytes((source / name).read_bytes())
-
-
-def write_videos(source: Path, target: Path, suffix: str) -> None:
-    (target / "videos").mkdir()
-    for folder in (source / "images").iterdir():
-        path = target / "videos" / f"{folder.name}{suffix}"
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), 2, (1600, 900))
-        for image in sorted(folder.iterdir()):
-            writer.write(cv2.imread(str(image)))
-        writer.release()
-
-
 @pytest.mark.slow
 def test_nuscenes_root_gives_the_same_frames(real_drive, nuscenes_root):
     sequence = open_sequence(nuscenes_root)
@@ -82,19 +63,6 @@ def test_boxes_are_counted_as_they_are_read_without_images(kind, request):
     assert not any(frame.images for frame in frames)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", [".mkv", ".avi"])
-def test_lossless_videos_give_the_same_frames(real_drive, tmp_path, suffix):
-    copy_without_images(real_drive, tmp_path / "videos_in")
-    write_videos(real_drive, tmp_path / "videos_in", suffix)
-    table = (real_drive / "frames.csv").read_text()
-    for number in range(4):
-        for camera in FolderDrive(real_drive).rig.names:
-            table = table.replace(f"images/{camera}/{number:06d}.jpg", f"videos/{camera}{suffix}#{number}")
-    (tmp_path / "videos_in" / "frames.csv").write_text(table)
-    assert_same_frames(open_sequence(real_drive), open_sequence(tmp_path / "videos_in"), same_bytes=False)
-
-
 @pytest.mark.parametrize("which", [pytest.param("native", marks=pytest.mark.slow), "nuscenes"])
 def test_converted_sequence_gives_the_same_frames(real_drive, nuscenes_root, tmp_path, which):
     source = open_sequence(real_drive if which == "native" else nuscenes_root)
@@ -102,12 +70,6 @@ def test_converted_sequence_gives_the_same_frames(real_drive, nuscenes_root, tmp
         for place in range(len(source.stamps)):
             writer.write(source.load(place))
     assert_same_frames(source, open_sequence(tmp_path / "out"), same_bytes=True)
-
-
-def test_scene_split_and_version_select_the_scene(nuscenes_root):
-    for options in ({"scene": "scene-0103"}, {"split": "mini_val"}, {"version": "v1.0-mini"}):
-        assert len(open_sequence(nuscenes_root, **options).stamps) == 4
-    assert open_sequence(nuscenes_root).load(0).sample_token == "3e8750f331d7499e9b5123e9eb70f2e2"
 
 
 def test_without_can_bus_kinematics_come_from_the_poses(nuscenes_root, tmp_path):

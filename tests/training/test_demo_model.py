@@ -44,12 +44,6 @@ def test_its_weights_are_in_the_package() -> None:
     assert (of_a_file.name, of_a_file.bundled) == ("demo", False)
 
 
-@pytest.mark.parametrize("name", ["tiny", "small", "base"])
-def test_other_models_do_not_run_without_weights(name: str) -> None:
-    with pytest.raises(WeightsError, match=f"model {name} has no weights: run `bevcli weights fetch {name}`"):
-        load_model(name)
-
-
 def test_a_users_model_file_does_not_get_the_packages_weights(tmp_path: Path) -> None:
     own = tmp_path / "demo.toml"
     own.write_text((STREET.parents[1] / "configs" / "demo.toml").read_text())

@@ -98,9 +98,8 @@ def test_no_known_class_is_an_error(prepare: Callable[..., TrainingJob], tmp_pat
 def test_refused_drives_leave_no_folder(
     names: tuple[str, ...], changes: dict, message: str, prepare: Callable[..., TrainingJob], tmp_path: Path
 ) -> None:
-    with pytest.raises(BevcliError, match=message) as caught:
+    with pytest.raises(BevcliError, match=message):
         prepare(*names, changes=changes)
-    assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
