@@ -10,10 +10,11 @@ from command_line import invoked
 from memory_drive import MemoryDrive
 
 from bevcli.errors import InputError
-from bevcli.frame import Frame
+from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.sequences.files.boxes_table import write_csv
+from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
 from bevcli.workshop.formats.labels import WithLabels, _labelled_frames
@@ -220,7 +221,7 @@ def in_other_units(length: float, width: float, yaw: float, unit: float = 1.0) -
     [
         (in_other_units(4.5, 1.9, -179.0), "the yaws, of up to 179, are taken to be in degrees"),
         (in_other_units(4.5, 1.9, 350.0), "the yaws, of up to 350, are taken to be in degrees"),
-        (in_other_units(1.9, 4.5, 1.0), "4 of 4 vehicles are wider than long: are length and width exchanged?"),
+        (in_other_units(1.9, 4.5, 1.0), "sides in the order width, length, height (the boxes: "),
     ],
 )
 def test_degrees_and_exchanged_sides_are_noted(text: str, note: str, tmp_path: Path) -> None:
@@ -247,3 +248,59 @@ def test_boxes_of_no_object_are_refused(text: str, message: str, tmp_path: Path)
     (tmp_path / "labels.csv").write_text(text)
     with pytest.raises(InputError, match=re.escape(message)):
         WithLabels(MadeDrive(4), tmp_path / "labels.csv")
+
+
+def street_table(path: Path, drive: Drive, **held: str) -> None:
+    """The ground truth of the sample drive as another program writes it."""
+    turned = {"x": (1, 0), "clockwise": (-1, 0), "compass": (-1, np.pi / 2), "kitti": (-1, -np.pi / 2)}
+    lidar_from_ego = np.eye(4)
+    lidar_from_ego[:3, 3] = -0.9, 0.0, -1.8
+    rows = [HEAD]
+    for place, stamp in enumerate(drive.stamps):
+        frame = drive.load(place)
+        frames = {"world": np.eye(4), "ego": np.linalg.inv(frame.world_from_ego.matrix)}
+        frames["bev"] = np.linalg.inv(frame.rig.ego_from_bev) @ frames["ego"]
+        frames["lidar"] = lidar_from_ego @ frames["ego"]
+        boxes = frame.ground_truth.transformed(frames[held.get("frame", "ego")])
+        sign, offset = turned[held.get("yaw", "x")]
+        for box in boxes:
+            sides = dict(zip("lwh", box.size_lwh, strict=True))
+            z = box.center[2] - (box.size_lwh[2] / 2 if "z" in held else 0)
+            yaw = sign * (box.yaw - offset)
+            numbers = (*box.center[:2], z, *(sides[side] for side in held.get("sides", "lwh")), yaw)
+            rows.append(",".join([str(stamp.index), box.class_name, *map(repr, map(float, numbers))]))
+    path.write_text("\n".join(rows))
+
+
+@pytest.fixture(scope="module")
+def street() -> Drive:
+    return open_sequence(Path(__file__).parents[2] / "samples/street", every=2, frames=slice(0, 6))
+
+
+@pytest.mark.parametrize(
+    ("held", "note"),
+    [
+        ({}, 'taken to be in the "ego" frame'),
+        ({"frame": "world", "sides": "wlh"}, "boxes in the world frame (the boxes: 0.0 m; boxes in the ego frame: "),
+        ({"frame": "bev", "yaw": "kitti"}, "yaws clockwise from -y, as rotation_y of KITTI (the boxes: "),
+        ({"yaw": "compass", "sides": "hlw"}, "sides in the order height, length, width (the boxes: "),
+        ({"z": "bottom", "yaw": "clockwise"}, "z of the bottom (the boxes: 0.0 m; z of the center: "),
+    ],
+)
+def test_boxes_show_what_a_table_holds(held: dict[str, str], note: str, street: Drive, tmp_path: Path) -> None:
+    street_table(tmp_path / "labels.csv", street, **held)
+    found = WithLabels(street, tmp_path / "labels.csv")
+    assert any(note in line for line in found.notes)
+    for place in range(len(street.stamps)):
+        one, other = found.load(place).ground_truth, street.load(place).ground_truth
+        np.testing.assert_allclose(one.to_numpy()[:, :6], other.to_numpy()[:, :6], atol=1e-6)
+        np.testing.assert_allclose(np.exp(1j * one.yaws), np.exp(1j * other.yaws), atol=1e-6)
+
+
+def test_a_table_that_fits_nothing_is_read_as_stated(street: Drive, tmp_path: Path) -> None:
+    path = tmp_path / "labels.csv"
+    street_table(path, street, frame="lidar")
+    with pytest.raises(InputError, match=r"fit no reading .*--labels-frame ego --labels-z center` to read it"):
+        WithLabels(street, path)
+    found = WithLabels(street, path, LabelOptions(labels_frame="ego", labels_z="center"))
+    assert any("what is stated does not fit the boxes" in note for note in found.notes)

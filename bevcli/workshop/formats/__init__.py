@@ -219,6 +219,26 @@ class LabelOptions:
         help="The camera in whose frame KITTI labels are. Default: the one that looks most directly ahead.",
         metavar="NAME",
     )
+    labels_frame: Literal["ego", "world", "bev"] | None = option(
+        default=None,
+        help="The frame of the boxes in a table of labels. Default: column frame_of_reference, or what the boxes show.",
+    )
+    labels_sides: Literal["lwh", "lhw", "wlh", "whl", "hlw", "hwl"] | None = option(
+        default=None,
+        help="What columns length, width and height of a table of labels hold: wlh for width, length, height. Default: "
+        "what the boxes show.",
+    )
+    labels_yaw: Literal["x", "y", "clockwise", "compass", "kitti"] | None = option(
+        default=None,
+        help="Yaw in a table of labels: counter-clockwise from x or y, clockwise from x, compass (clockwise from y) or "
+        "kitti (its rotation_y). Default: what the boxes show.",
+    )
+    labels_yaw_unit: Literal["radians", "degrees"] | None = option(
+        default=None, help="Unit of yaw in a table of labels. Default: what the boxes show."
+    )
+    labels_z: Literal["center", "bottom"] | None = option(
+        default=None, help="Point of a box whose z a table of labels has. Default: what the boxes show."
+    )
 
 
 @options()

@@ -64,7 +64,9 @@ def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labe
         f"the boxes are those that {name} sees, in its frame (`labels_camera` (`--labels-camera`)); others have no "
         "labels"
     )
-    return Labels("ego", tuple(frames), lists_empty=path.is_dir(), notes=(note,))
+    states = {"labels_frame": "ego", "labels_sides": "lwh", "labels_z": "center", "labels_yaw": "x"}
+    states["labels_yaw_unit"] = "radians"
+    return Labels(states, tuple(frames), lists_empty=path.is_dir(), notes=(note,))
 
 
 def _looking_ahead(rig: CameraRig) -> str:

@@ -28,7 +28,15 @@ from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
 from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment, check_labels
+from bevcli.workshop.formats.label_readings import PlacedBoxes, decide
 
+STATING = (
+    "labels_frame",
+    "labels_sides",
+    "labels_z",
+    "labels_yaw",
+    "labels_yaw_unit",
+)  # options that state what a table holds
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
 
@@ -44,7 +52,9 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
-    return check_labels(path, replace(labels, frames=frames, notes=(*labels.notes, *note)))
+    labels = replace(labels, frames=frames, notes=(*labels.notes, *note))
+    check_labels(path, labels)
+    return labels
 
 
 def with_labels(drive: Drive, options: LabelOptions) -> Drive:
@@ -66,13 +76,12 @@ class WithLabels(DerivedDrive):
     def __init__(self, sequence: Drive, path: Path, options: LabelOptions = LabelOptions()) -> None:
         super().__init__(sequence)
         labels = read_labels(path, sequence.rig, options)
-        if labels.frame_of_reference == "world" and not sequence.has_ego_motion:
-            raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
-        boxes, note = _with_velocities(sequence, _in_world(sequence, labels, path))
+        boxes, said = _in_world(sequence, labels, path, options)
+        boxes, note = _with_velocities(sequence, boxes)
         unlisted = "unlabelled" if labels.lists_empty else options.unlisted_frames
         labelled = _labelled_frames(sequence.stamps, boxes, unlisted)
         self._listed, self._boxes = len(boxes), {index: Boxes3D.empty() for index in labelled} | boxes
-        notes = (*labels.notes, *note, self._summary())
+        notes = (*labels.notes, *said, *note, self._summary())
         self.notes = (*sequence.notes, *(f"{path}: {text}" for text in notes))
 
     @property
@@ -116,11 +125,13 @@ def _labelled_frames(
     return labelled
 
 
-def _in_world(sequence: Drive, labels: Labels, path: Path) -> dict[int, Boxes3D]:
-    """The boxes in the world frame, by index of the frame in the drive."""
+def _in_world(
+    sequence: Drive, labels: Labels, path: Path, options: LabelOptions
+) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
+    """The boxes in the world frame, by index of the frame in the drive; notes on how they are read."""
     times = np.array([stamp.timestamp_ns for stamp in sequence.stamps], dtype=np.int64)
     index_of = {stamp.index: index for index, stamp in enumerate(sequence.stamps)}
-    boxes_of: dict[int, Boxes3D] = {}
+    placed: dict[int, PlacedBoxes] = {}
     for labelled in labels.frames:
         index = _index(labelled, times, index_of)
         if index is None:
@@ -128,15 +139,18 @@ def _in_world(sequence: Drive, labels: Labels, path: Path) -> dict[int, Boxes3D]
                 f"{path}: {_words(labelled)} is not in the drive (expected indices {min(index_of)} to {max(index_of)}, "
                 f"times {times.min()} to {times.max()} ns): are these the labels of this drive?"
             )
-        if index in boxes_of:
+        if index in placed:
             raise InputError(f"{path}: {_words(labelled)}: its frame of the drive has labels already")
-        boxes = labelled.boxes
-        if labels.frame_of_reference != "world" and len(boxes):
-            frame = sequence.ground_truth_frame(index)
-            boxes = boxes.transformed(frame.rig.ego_from_bev) if labels.frame_of_reference == "bev" else boxes
-            boxes = boxes.transformed(frame.world_from_ego.matrix)
-        boxes_of[index] = boxes
-    return boxes_of
+        frame = sequence.ground_truth_frame(index)
+        ego = frame.world_from_ego.matrix
+        world_from = {"ego": ego, "bev": ego @ frame.rig.ego_from_bev, "world": np.eye(4)}
+        placed[index] = PlacedBoxes(frame.stamp.scene, labelled.boxes, world_from)
+    stated = {name: value for name in STATING if (value := getattr(options, name)) is not None}
+    stated = {**labels.states, **stated}
+    if stated.get("labels_frame") == "world" and not sequence.has_ego_motion:
+        raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
+    states, notes = decide(path, [placed[index] for index in sorted(placed)], stated)
+    return {index: each.read_as(states) for index, each in placed.items()}, notes
 
 
 def _with_velocities(sequence: Drive, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
@@ -212,11 +226,10 @@ def read_csv_labels(path: Path) -> Labels:
     notes = [f"found {', '.join(marks)}"] if marks else []
     others = [name for name in columns if name not in ("class", *NUMBERS, *OPTIONAL, *UNUSED)]
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
-    if "frame_of_reference" not in columns:
-        notes.append('there is no column frame_of_reference: the boxes are taken to be in the "ego" frame')
     moments, boxes = _moments(path, rows), _boxes(rows, columns)
     frames = tuple(LabelledFrame(*moment, boxes[numbers]) for moment, numbers in moments.items())
-    return Labels(_frame_of_reference(path, rows), frames, lists_empty=False, notes=tuple(notes))
+    states = {"labels_frame": _frame_of_reference(path, rows)} if "frame_of_reference" in columns else {}
+    return Labels(states, frames, lists_empty=False, notes=tuple(notes))
 
 
 def _text(path: Path) -> tuple[str, list[str]]:
