@@ -21,7 +21,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.files import MIB, open_regular, read_bytes, run_python
 from bevcli.printing import reason_of
 from bevcli.recording.entities import EGO_COLOR, class_colors
-from bevcli.recording.log_static import Mesh, VehicleMesh
+from bevcli.recording.meshes import Mesh, VehicleMesh
 
 FORMATS = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")  # no archives, whose contents may have any size
 MEMORY, SECONDS = 1024 * MIB, 20.0  # limits of the process

@@ -14,7 +14,8 @@ from bevcli.recording import entities
 from bevcli.recording.entities import EGO_COLOR, RING_COLOR, class_colors, map_colors
 from bevcli.recording.log_boxes import MOVING_M_S, box_colors, image_box_colors
 from bevcli.recording.log_cameras import PosedCamera, box_labels, labels_in_image, lines_in_images
-from bevcli.recording.log_static import bev_image_points, default_vehicle, range_lines
+from bevcli.recording.log_static import bev_image_points, range_lines
+from bevcli.recording.meshes import default_vehicle
 from bevcli.viewer import drawing
 from bevcli.viewer.drawing import Canvas
 

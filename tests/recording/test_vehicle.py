@@ -13,7 +13,7 @@ from bevcli.errors import InputError
 from bevcli.parsing.files import read_bytes
 from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.entities import EGO_COLOR
-from bevcli.recording.log_static import default_vehicle
+from bevcli.recording.meshes import default_vehicle
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop import meshes
 from bevcli.workshop.meshes import load_vehicle, read_parts
