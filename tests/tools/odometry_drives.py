@@ -1,4 +1,6 @@
-"""The rendered drives of `odometry_accuracy.py`: `python tests/tools/odometry_drives.py OUT [--only NAME…]`.
+"""The rendered drives of `odometry_accuracy.py`.
+
+    python tests/tools/odometry_drives.py OUT [--only NAME…] [--body moving]
 
 Twenty seeds with five rigs at 2 Hz, among them night, rain, standing, reversing and sharp turns; two hard drives; and
 two with a body that moves. Seeds from 1,065,000 on; `bevcli render` draws no rain, no night and no reversing.
@@ -225,6 +227,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", default=[], help="parts of names")
+    parser.add_argument("--body", choices=("still", "moving"), help="of all drives, instead of their own")
     given = parser.parse_args()
     assets = Assets.build()
     for plan in PLANS:
@@ -233,7 +236,7 @@ def main() -> None:
             continue
         unfinished = folder.with_suffix(".unfinished")
         shutil.rmtree(unfinished, ignore_errors=True)
-        export_drive(PlannedDrive(plan, assets), unfinished)
+        export_drive(PlannedDrive(replace(plan, body=given.body or plan.body), assets), unfinished)
         unfinished.rename(folder)
         say(f"{folder}: seed {plan.seed}")
 
