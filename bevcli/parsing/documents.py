@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +39,10 @@ CSV_BYTES = 256 << 20
 NANOSECONDS_FROM = 16  # power of ten; since 1970, fewer nanoseconds ended in April 1970, and more µs in the year 2286
 UNITS = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
 LARGEST_NUMBER = 1e12  # in SI units, far beyond any position or motion of a vehicle
+# Members of objects in JSON, see `typed`. Numbers may be NaN.
+Number = Annotated[float, msgspec.Meta(gt=-LARGEST_NUMBER, lt=LARGEST_NUMBER)]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=400)]
+_Form = TypeVar("_Form")
 
 
 def read_json(
@@ -93,6 +98,19 @@ def parse_json(text: bytes, path: Path, *, namespaces: bool = False, keys_checke
         raise InputError(f"{path}: {position}: broken JSON: {error.msg}") from None
     except UnicodeError as error:
         raise InputError(f"{path}: cannot be read as JSON ({reason_of(error)[:200]})") from None
+
+
+def typed(value: Any, form: type[_Form], location: object) -> _Form:
+    """A value of a JSON, YAML or TOML file as a type of msgspec. Raises InputError, which names the place in it.
+
+    location: the file, and the place of the value in it.
+    """
+    try:
+        return msgspec.convert(value, form)
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at `$")
+        parts = (str(location), place.removesuffix("`").lstrip("."), problem[:1].lower() + problem[1:])
+        raise InputError(": ".join(filter(None, parts))) from None
 
 
 def first_twice(keys: Sequence[Hashable]) -> int | None:

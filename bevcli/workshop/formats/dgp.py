@@ -1,14 +1,15 @@
 """A DGP scene as a drive: its samples with images and point clouds, each with a pose, calibrations, 3D boxes."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
@@ -16,7 +17,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
-from bevcli.parsing.documents import LARGEST_INTEGER, read_json
+from bevcli.parsing.documents import LARGEST_INTEGER, Number, Text, read_json, typed
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import Format
@@ -33,156 +34,145 @@ CLASS_OF_CATEGORY = {
     "Towed Object": "trailer",
     "Caravan/RV": "truck",
 }
-LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-PINHOLE = ("fx", "fy", "cx", "cy")
 BROWN_CONRADY = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 OTHER_LENSES = ("fisheye", "s1", "s2", "s3", "s4", "taux", "tauy", "alpha", "beta", "w", "xi", "equirectangular")
 TENFOLD = "the times of the scene are after the year 2116: they are taken as ten times too large, as in DDAD"
 BOXES_3D = "1"  # the number of 3D boxes among DGP's kinds of annotations
-SIZE = ("length", "width", "height")
-FileOf = Callable[["Record", str], Path]  # the file that a member of an object names
 
 
-class Record:
-    """A JSON object of a file, whose members are checked when they are asked for. Errors name file and member.
+# The objects in the files of a scene, as far as they are used. Other members are left out.
 
-    value: the object. where: the file and the place in it, for messages. Raises InputError if it is no object.
-    """
 
-    def __init__(self, value: Any, where: str) -> None:
-        if not isinstance(value, dict):
-            raise InputError(f"{where}: expected an object, found {type(value).__name__}")
-        self.value: Mapping[str, Any] = value
-        self.where = where
+class _StatedPose(Struct):
+    rotation: dict[str, Number]  # qw, qx, qy, qz; a missing number is 0
+    translation: dict[str, Number]  # x, y, z in metres
 
-    def record(self, name: str) -> "Record":
-        """A member that is an object. Raises InputError."""
-        return Record(self._member(name), f"{self.where}: {name}")
+    def __post_init__(self) -> None:
+        if not np.linalg.norm(_numbers(self.rotation, ("qw", "qx", "qy", "qz"))) > SHORTEST_QUATERNION:
+            raise ValueError("expected a quaternion of norm 1, found norm 0")
 
-    def records(self, name: str) -> list["Record"]:
-        """A member that is a list of objects. Raises InputError."""
-        value = self._member(name)
-        if not isinstance(value, list):
-            raise InputError(f'{self.where}: "{name}": expected a list, found {type(value).__name__}')
-        return [Record(member, f"{self.where}: {name}[{index}]") for index, member in enumerate(value)]
-
-    def text(self, name: str) -> str:
-        """A member that is a text of at most 400 characters. Raises InputError."""
-        value = self._member(name)
-        if not isinstance(value, str) or not 0 < len(value) <= 400:
-            raise InputError(f'{self.where}: "{name}": expected a text of at most 400 characters')
-        return value
-
-    def texts(self, name: str) -> list[str]:
-        """A member that is a list of texts. Raises InputError."""
-        value = self._member(name)
-        if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-            raise InputError(f'{self.where}: "{name}": expected a list of texts')
-        return value
-
-    def numbers(self, names: tuple[str, ...], default: float | None = None) -> Array:
-        """(N,) members that are finite numbers. A missing one is `default`; with None it raises InputError."""
-        values = [self._member(name) if default is None or name in self.value else default for name in names]
-        if any(type(value) not in (int, float) or not abs(value) < LARGEST_NUMBER for value in values):
-            raise InputError(f"{self.where}: expected finite numbers {', '.join(names)}, found {values!r:.80}")
-        return np.array(values, dtype=np.float64)
-
-    def integer(self, name: str, default: int | None = None) -> int:
-        """A member that is an integer. Raises InputError as `numbers`."""
-        value = self._member(name) if default is None or name in self.value else default
-        if type(value) is not int:
-            raise InputError(f'{self.where}: "{name}": expected an integer, found {value!r:.40}')
-        return value
-
+    @property
     def pose(self) -> Pose:
-        """The pose of {"rotation": {"qw", ...}, "translation": {"x", ...}}. Raises InputError."""
-        rotation = self.record("rotation").numbers(("qw", "qx", "qy", "qz"), 0.0)
-        if not np.linalg.norm(rotation) > SHORTEST_QUATERNION:
-            raise InputError(f"{self.where}: expected a quaternion of norm 1, found norm 0")
-        return Pose(self.record("translation").numbers(("x", "y", "z"), 0.0), rotation / np.linalg.norm(rotation))
-
-    def timestamp(self) -> datetime:
-        """The time of {"timestamp": "2019-05-03T21:39:53.820375Z"}. Raises InputError."""
-        text = self.text("timestamp")
-        try:
-            time = datetime.fromisoformat(text)
-        except ValueError:
-            raise InputError(
-                f'{self.where}: "timestamp": expected such as 2019-05-03T21:39:53Z, found "{text:.40}"'
-            ) from None
-        return time if time.tzinfo else time.replace(tzinfo=UTC)
-
-    def _member(self, name: str) -> Any:
-        if name not in self.value:
-            raise InputError(f'{self.where}: "{name}" is missing')
-        return self.value[name]
+        rotation = _numbers(self.rotation, ("qw", "qx", "qy", "qz"))
+        return Pose(_numbers(self.translation, ("x", "y", "z")), rotation / np.linalg.norm(rotation))
 
 
-def read_record(path: Path) -> Record:
-    """The object in a JSON file. Raises InputError."""
-    return Record(read_json(path), str(path))
+class _Identity(Struct):
+    timestamp: datetime
+    name: str = ""  # of the sensor
 
 
-def _nanoseconds(times: list[datetime], where: str) -> tuple[list[int], bool]:
-    """The times since 1970 in ns, and whether they were divided by ten. Raises InputError beyond any year.
+class _Content(Struct, kw_only=True):
+    pose: _StatedPose  # in the world, at its own time
+    annotations: dict[str, Text] = {}  # files by kind
 
-    DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
-    frame per second in place of ten. where: start of a message.
-    """
-    times_ns = [(time - EPOCH) // timedelta(microseconds=1) * 1000 for time in times]
-    tenfold = max(times_ns) > LARGEST_INTEGER
-    times_ns = [time // 10 for time in times_ns] if tenfold else times_ns
-    if not 0 <= min(times_ns) <= max(times_ns) <= LARGEST_INTEGER:
-        raise InputError(
-            f"{where}: the times {min(times)} to {max(times)} are impossible (expected years from 1970 on)"
-        )
-    return times_ns, tenfold
+
+class _Image(_Content, kw_only=True):
+    filename: Text
+    width: int
+    height: int
+
+
+class _Contents(Struct):
+    image: _Image | None = None
+    point_cloud: _Content | None = None
+
+
+class _Datum(Struct):
+    key: Text
+    id: _Identity
+    datum: _Contents
+
+
+class _Sample(Struct):
+    id: _Identity
+    calibration_key: Text
+    datum_keys: list[str]
+
+
+class _SceneFile(Struct):
+    data: list[_Datum]
+    samples: Annotated[list[_Sample], Meta(min_length=1)]
+    ontologies: dict[str, Text] = {}  # files by kind of annotations
+
+
+class _CalibrationFile(Struct):
+    names: list[str]  # of the sensors
+    intrinsics: list[dict[str, Number]]
+    extrinsics: list[_StatedPose]
+
+
+class _Class(Struct):
+    name: Text
+    id: int = 0
+
+
+class _OntologyFile(Struct):
+    items: list[_Class]
+
+
+class _Box(Struct):
+    pose: _StatedPose  # in the frame of the point cloud
+    length: Number
+    width: Number
+    height: Number
+
+
+class _Annotation(Struct):
+    box: _Box
+    class_id: int = 0
+    instance_id: int = 0  # 0 is that of a box without one
+    num_points: int = 0
+
+
+class _BoxesFile(Struct):
+    annotations: list[_Annotation]
+
+
+def _numbers(stated: Mapping[str, float], names: Iterable[str]) -> Array:
+    return np.array([stated.get(name, 0.0) for name in names], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Calibration:
     """The poses of all sensors, and the lenses of the cameras among them, by sensor."""
 
+    path: Path
     ego_from: Mapping[str, Pose]
-    lenses: Mapping[str, Record]
+    lenses: Mapping[str, Mapping[str, float]]
 
     def camera(self, name: str, size: tuple[int, int]) -> Camera:
         """A camera with the size of its image (width, height). Raises InputError."""
         lens = self.lenses[name]
-        fx, fy, cx, cy = lens.numbers(PINHOLE)
         for other in OTHER_LENSES:
-            if lens.numbers((other,), 0.0).any():
+            if lens.get(other):
                 raise InputError(
-                    f'{lens.where}: camera {name}: the lens has "{other}", which is not supported (expected a pinhole '
+                    f'{self.path}: camera {name}: the lens has "{other}", which is not supported (expected a pinhole '
                     f"camera with {', '.join(BROWN_CONRADY)}): undistort the images"
                 )
-        (skew,) = lens.numbers(("skew",), 0.0)
+        fx, fy, cx, cy, skew = _numbers(lens, ("fx", "fy", "cx", "cy", "skew"))
         intrinsics = np.array([[fx, skew, cx], [0, fy, cy], [0, 0, 1]])
-        distortion = brown_conrady(lens.numbers(BROWN_CONRADY, 0.0))
-        return checked_camera(Camera(name, *size, intrinsics, self.ego_from[name].matrix, distortion), lens.where)
+        distortion = brown_conrady(_numbers(lens, BROWN_CONRADY))
+        return checked_camera(Camera(name, *size, intrinsics, self.ego_from[name].matrix, distortion), self.path)
 
 
 def _read_calibration(path: Path) -> Calibration:
-    record = read_record(path)
-    names, lenses, poses = record.texts("names"), record.records("intrinsics"), record.records("extrinsics")
-    if not len(names) == len(set(names)) == len(lenses) == len(poses):
+    file = typed(read_json(path), _CalibrationFile, path)
+    if not len(file.names) == len(set(file.names)) == len(file.intrinsics) == len(file.extrinsics):
         raise InputError(f"{path}: expected as many names as intrinsics and extrinsics, each name once")
-    return Calibration(
-        dict(zip(names, (pose.pose() for pose in poses), strict=True)), dict(zip(names, lenses, strict=True))
-    )
+    ego_from = {name: stated.pose for name, stated in zip(file.names, file.extrinsics, strict=True)}
+    return Calibration(path, ego_from, dict(zip(file.names, file.intrinsics, strict=True)))
 
 
 @dataclass(frozen=True)
-class Datum:
-    """One image or point cloud, with the pose at its own time. content: the object "image" or "point_cloud"."""
+class Measurement:
+    """One image or point cloud, with the time."""
 
     sensor: str
-    is_image: bool
-    content: Record
+    content: _Image | _Content
     time_ns: int
-    world_from_sensor: Pose
 
 
 @dataclass(frozen=True)
@@ -190,76 +180,72 @@ class Sample:
     """The images and point clouds of one moment, at least one. calibration: of their sensors."""
 
     time_ns: int
-    data: tuple[Datum, ...]
+    data: tuple[Measurement, ...]
     calibration: Calibration
 
-    def ego_pose(self, datum: Datum) -> Pose:
+    def ego_pose(self, datum: Measurement) -> Pose:
         """world_from_ego at the time of one of its data."""
-        return Pose.from_matrix(
-            datum.world_from_sensor.matrix @ inverse(self.calibration.ego_from[datum.sensor].matrix)
-        )
+        ego_from_sensor = self.calibration.ego_from[datum.sensor].matrix
+        return Pose.from_matrix(datum.content.pose.pose.matrix @ inverse(ego_from_sensor))
 
-    def images(self) -> dict[str, Record]:
-        """The content of each camera's image."""
-        return {datum.sensor: datum.content for datum in self.data if datum.is_image}
+    def images(self) -> dict[str, _Image]:
+        """Each camera's image."""
+        return {datum.sensor: datum.content for datum in self.data if isinstance(datum.content, _Image)}
 
-    def rig(self, others: Mapping[str, Record]) -> CameraRig:
+    def rig(self, others: Mapping[str, _Image]) -> CameraRig:
         """The cameras in the order of the calibration. others: their images elsewhere, for sizes. Raises InputError."""
         images = {**others, **self.images()}
         if unknown := [name for name in images if name not in self.calibration.ego_from]:
-            raise InputError(f'{images[unknown[0]].where}: a calibration has no sensor "{unknown[0]}"')
+            raise InputError(f'{self.calibration.path}: has no sensor "{unknown[0]}", of which there are images')
         names = [name for name in self.calibration.ego_from if name in images]
-        sizes = [(images[name].integer("width"), images[name].integer("height")) for name in names]
-        cameras = tuple(map(self.calibration.camera, names, sizes))
-        return CameraRig(cameras, default_ego_from_bev(), ego_from_bev_assumed=True)
+        cameras = (self.calibration.camera(name, (images[name].width, images[name].height)) for name in names)
+        return CameraRig(tuple(cameras), default_ego_from_bev(), ego_from_bev_assumed=True)
 
 
-def _read_samples(path: Path, scene: Record) -> tuple[tuple[Sample, ...], bool]:
-    """The samples in order of time, and whether the times were divided by ten, see `_nanoseconds`. Raises InputError.
+def _read_samples(path: Path, scene: _SceneFile, file: Path) -> tuple[tuple[Sample, ...], bool]:
+    """The samples in order of time, and whether their times were divided by ten. Raises InputError.
+
+    DDAD's files state tenths of microseconds as microseconds: a drive of 2019 seems to be of the year 2463, with one
+    frame per second in place of ten.
 
     path: the folder of the scene. scene: the contents of its file.
     """
-    records = {record.text("key"): record for record in scene.records("data")}
-    samples = sorted(scene.records("samples"), key=lambda sample: sample.record("id").timestamp())
-    if not samples:
-        raise InputError(f"{scene.where}: has no samples (expected at least one)")
-    owners = [*records.values(), *samples]
-    times, tenfold = _nanoseconds([owner.record("id").timestamp() for owner in owners], scene.where)
-    data = {key: _datum(record, time) for (key, record), time in zip(records.items(), times, strict=False)}
+    stamps = [datum.id.timestamp for datum in scene.data] + [sample.id.timestamp for sample in scene.samples]
+    stamps = [stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC) for stamp in stamps]
+    times = [(stamp - EPOCH) // timedelta(microseconds=1) * 1000 for stamp in stamps]
+    tenfold = max(times) > LARGEST_INTEGER
+    times = [time // 10 for time in times] if tenfold else times
+    if not 0 <= min(times) <= max(times) <= LARGEST_INTEGER:
+        raise InputError(f"{file}: has impossible times (expected years from 1970 on)")
+    data = {datum.key: _measurement(datum, time) for datum, time in zip(scene.data, times, strict=False)}
     calibration_of = cache(lambda key: _read_calibration(path / "calibration" / f"{key}.json"))
-    samples_with_data = []
-    for sample, time in zip(samples, times[len(records) :], strict=True):
-        calibration = calibration_of(sample.text("calibration_key"))
-        samples_with_data.append(Sample(time, _data_of(sample, data, calibration), calibration))
-    if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(samples_with_data)):
-        raise InputError(f"{scene.where}: two samples have the same time (expected increasing times)")
-    return tuple(samples_with_data), tenfold
+    samples = [
+        Sample(time, _data_of(sample, data, file), calibration_of(sample.calibration_key))
+        for sample, time in zip(scene.samples, times[len(scene.data) :], strict=True)
+    ]
+    samples.sort(key=lambda sample: sample.time_ns)
+    for sample in samples:
+        for datum in sample.data:
+            if datum.sensor not in sample.calibration.ego_from:
+                raise InputError(f'{sample.calibration.path}: has no sensor "{datum.sensor}", which a sample has')
+    if any(later.time_ns <= earlier.time_ns for earlier, later in pairwise(samples)):
+        raise InputError(f"{file}: two samples have the same time (expected increasing times)")
+    return tuple(samples), tenfold
 
 
-def _data_of(sample: Record, data: dict[str, Datum | None], calibration: Calibration) -> tuple[Datum, ...]:
-    data_of_sample = []
-    for key in sample.texts("datum_keys"):
+def _measurement(datum: _Datum, time_ns: int) -> Measurement | None:
+    content = datum.datum.image or datum.datum.point_cloud
+    return None if content is None else Measurement(datum.id.name, content, time_ns)
+
+
+def _data_of(sample: _Sample, data: Mapping[str, Measurement | None], file: Path) -> tuple[Measurement, ...]:
+    for key in sample.datum_keys:
         if key not in data:
-            raise InputError(f'{sample.where}: datum "{key:.40}" is missing in "data"')
-        datum = data[key]
-        if datum is None:
-            continue
-        if datum.sensor not in calibration.ego_from:
-            raise InputError(f'{sample.where}: its calibration has no sensor "{datum.sensor}"')
-        data_of_sample.append(datum)
-    if not data_of_sample:
-        raise InputError(f"{sample.where}: has no image and no point cloud (expected at least one)")
-    return tuple(data_of_sample)
-
-
-def _datum(record: Record, time_ns: int) -> Datum | None:
-    contents = record.record("datum")
-    datum_type = next((name for name in ("image", "point_cloud") if name in contents.value), None)
-    if datum_type is None:
-        return None
-    content = contents.record(datum_type)
-    pose = content.record("pose").pose()
-    return Datum(record.record("id").text("name"), datum_type == "image", content, time_ns, pose)
+            raise InputError(f'{file}: a sample has the datum "{key:.40}", which is missing in "data"')
+    of_sample = tuple(datum for key in sample.datum_keys if (datum := data[key]) is not None)
+    if not of_sample:
+        raise InputError(f"{file}: a sample has no image and no point cloud (expected at least one)")
+    return of_sample
 
 
 def _poses(samples: Iterable[Sample], *, keys: bool) -> PoseTable:
@@ -279,55 +265,51 @@ def open_scene(path: Path, common: InputOptions, options: Format) -> ListedDrive
     The ego frame is DDAD's: below the rear axle, on the ground. Raises InputError.
     """
     common.refuse_static(path)
-    scene = read_record(_scene_file(path))
-    samples, tenfold = _read_samples(path, scene)
+    file = _scene_file(path)
+    scene = typed(read_json(file), _SceneFile, file)
+    samples, tenfold = _read_samples(path, scene, file)
     images = {name: image for sample in samples for name, image in sample.images().items()}
     if not images:
-        raise InputError(f"{scene.where}: no sample has an image (expected at least one)")
+        raise InputError(f"{file}: no sample has an image (expected at least one)")
     rigs = tuple(sample.rig(images) for sample in samples)
-    file_of = partial(_file, path, allow_outside=common.allow_outside)
-    entries = tuple(_entry(path, index, sample, rigs[0], file_of) for index, sample in enumerate(samples))
+    entries = tuple(_entry(path, index, sample, rigs[0], common) for index, sample in enumerate(samples))
     motion = motion_of_keyframes(_poses(samples, keys=True), _poses(samples, keys=False))
-    truth = _read_truth(path, scene, samples, common.class_map, file_of) if common.ground_truth else {}
+    truth = _read_truth(path, scene, samples, common) if common.ground_truth else {}
     notes = (*bev_frame_notes(rigs[0], "a DGP scene"), *((TENFOLD,) if tenfold else ()))
     files = tuple(sorted((*path.glob("scene_*.json"), *path.glob("calibration/*.json"))))
     return ListedDrive(path, common, rigs, entries, motion, truth, notes, files)
 
 
-def _entry(path: Path, index: int, sample: Sample, rig: CameraRig, file_of: FileOf) -> FrameEntry:
+def _entry(path: Path, index: int, sample: Sample, rig: CameraRig, common: InputOptions) -> FrameEntry:
     sources = {
-        datum.sensor: ImageSource(file_of(datum.content, "filename"), datum.time_ns)
+        datum.sensor: ImageSource(_file(path, datum.content.filename, common), datum.time_ns)
         for datum in sample.data
-        if datum.is_image
+        if isinstance(datum.content, _Image)
     }
     dropped = {name: "no image in the sample" for name in rig.names if name not in sources}
     return FrameEntry(FrameStamp(index, "", sample.time_ns), sources, dropped, str(path))
 
 
-def _file(path: Path, record: Record, member: str, *, allow_outside: bool) -> Path:
-    name = record.text(member)
+def _file(path: Path, name: str, common: InputOptions) -> Path:
+    """The file that a member of an object names. Raises InputError for one outside of the folder."""
     file = path / PurePosixPath(name)
-    if not allow_outside and leads_out(file, path):
-        where = f"{record.where}: {name:.100}"
-        raise InputError(f"{where}: leads out of the folder: pass `allow_outside=True` (`--allow-outside`) to read it")
+    if not common.allow_outside and leads_out(file, path):
+        raise InputError(f"{file}: leads out of the folder: pass `allow_outside=True` (`--allow-outside`) to read it")
     return file
 
 
-def _read_truth(
-    path: Path, scene: Record, samples: Iterable[Sample], class_map: Mapping[str, str], file_of: FileOf
-) -> dict[int, Boxes3D]:
+def _read_truth(path: Path, scene: _SceneFile, samples: Iterable[Sample], common: InputOptions) -> dict[int, Boxes3D]:
     """The boxes in the world frame of each sample that has a point cloud with boxes."""
     boxes_of, times = {}, []
     classes: dict[int, str] | None = None
     for index, sample in enumerate(samples):
-        for cloud in (datum for datum in sample.data if not datum.is_image):
-            annotations = cloud.content.record("annotations")
-            if BOXES_3D in annotations.value:
-                classes = _read_ontology(path, scene, class_map) if classes is None else classes
-                boxes_file = file_of(annotations, BOXES_3D)
-                boxes_of[index] = _read_boxes(boxes_file, cloud.world_from_sensor.matrix, classes)
-                times.append(sample.time_ns)
-                break
+        clouds = (datum.content for datum in sample.data if not isinstance(datum.content, _Image))
+        for cloud in (cloud for cloud in clouds if BOXES_3D in cloud.annotations):
+            classes = _read_ontology(path, scene, common.class_map) if classes is None else classes
+            file = _file(path, cloud.annotations[BOXES_3D], common)
+            boxes_of[index] = _read_boxes(file, cloud.pose.pose.matrix, classes)
+            times.append(sample.time_ns)
+            break
     return dict(zip(boxes_of, with_track_velocities(list(boxes_of.values()), times), strict=True))
 
 
@@ -339,26 +321,23 @@ def _scene_file(path: Path) -> Path:
     raise InputError(f"{path}: expected one file scene_*.json, found {names}")
 
 
-def _read_ontology(folder: Path, scene: Record, class_map: Mapping[str, str]) -> dict[int, str]:
+def _read_ontology(folder: Path, scene: _SceneFile, class_map: Mapping[str, str]) -> dict[int, str]:
+    path = folder / "ontology" / f"{scene.ontologies.get(BOXES_3D)}.json"
     names = ClassNames.of_format(CLASS_OF_CATEGORY, class_map)
-    items = read_record(folder / "ontology" / f"{scene.record('ontologies').text(BOXES_3D)}.json").records("items")
-    return {item.integer("id", 0): names[item.text("name")] for item in items}
+    return {each.id: names[each.name] for each in typed(read_json(path), _OntologyFile, path).items}
 
 
 def _read_boxes(path: Path, world_from_sensor: Array, classes: Mapping[int, str]) -> Boxes3D:
-    records = read_record(path).records("annotations")
-    if not records:
+    rows = typed(read_json(path), _BoxesFile, path).annotations
+    if not rows:
         return Boxes3D.empty()
-    boxes = [record.record("box") for record in records]
-    world_from_box = [world_from_sensor @ box.record("pose").pose().matrix for box in boxes]
-    ids = [record.integer("class_id", 0) for record in records]
-    things = [record.integer("instance_id", 0) for record in records]  # 0 is that of a box without one
+    world_from_box = [world_from_sensor @ row.box.pose.pose.matrix for row in rows]
     return Boxes3D(
         np.stack([pose[:3, 3] for pose in world_from_box]),
-        np.stack([box.numbers(SIZE) for box in boxes]),
+        np.array([[row.box.length, row.box.width, row.box.height] for row in rows], dtype=np.float64),
         np.array([yaw_of_rotation(pose[:3, :3]) for pose in world_from_box]),
-        np.full((len(boxes), 2), np.nan),
-        np.array([classes.get(number, f"class {number}") for number in ids], dtype=np.str_),
-        instances=np.array([str(thing or "") for thing in things], dtype=np.str_),
-        num_points=np.array([record.integer("num_points", 0) for record in records], dtype=np.int64),
+        np.full((len(rows), 2), np.nan),
+        np.array([classes.get(row.class_id, f"class {row.class_id}") for row in rows], dtype=np.str_),
+        instances=np.array([str(row.instance_id or "") for row in rows], dtype=np.str_),
+        num_points=np.array([row.num_points for row in rows], dtype=np.int64),
     )
