@@ -109,8 +109,8 @@ def typed(value: Any, form: type[_Form], location: object) -> _Form:
         return msgspec.convert(value, form)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
-        parts = (str(location), place.removesuffix("`").lstrip("."), problem[:1].lower() + problem[1:])
-        raise InputError(": ".join(filter(None, parts))) from None
+        place = place.removesuffix("`").replace(".", ": ", place.startswith("."))
+        raise InputError(f"{location}{place}: {problem[:1].lower()}{problem[1:]}") from None
 
 
 def first_twice(keys: Sequence[Hashable]) -> int | None:

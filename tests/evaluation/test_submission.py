@@ -156,10 +156,10 @@ def test_a_submission_is_read_back(tmp_path: Path, tracking: bool) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("translation", [1, 2], "sample t0: box 0: center: expected 3 numbers"),
+        ("translation", [1, 2], r"sample t0: boxes\[0\].center: expected `array` of length 3, got 2"),
         ("rotation", [0, 0, 0, 0], "sample t0: box 0: rotation: expected 4 numbers of norm 1"),
-        ("detection_name", 3, "sample t0: box 0: class: expected a name"),
-        ("detection_score", None, "sample t0: box 0: score"),
+        ("detection_name", 3, r"sample t0: boxes\[0\].class: expected `str`, got `int`"),
+        ("detection_score", None, r"sample t0: boxes\[0\].score"),
     ],
 )
 def test_a_wrong_submission_is_named(tmp_path: Path, key: str, value: Any, message: str) -> None:

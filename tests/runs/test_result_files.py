@@ -124,11 +124,11 @@ def test_points_lie_on_the_ground_below_the_bev_frame() -> None:
     ("change", "message"),
     [
         ({"format": "bevcli-map-lines/2"}, "is not a file of map lines"),
-        ({"classes": "divider"}, '"classes" must be a list of names'),
+        ({"classes": "divider"}, "classes: expected `array`, got `str`"),
         ({"frames": [{"frame": 0}]}, "entry 0 of frames"),
         (
             {"frames": [{"frame": 0, "timestamp_ns": 0, "lines": [{"class": "a", "points": [[0, 0]]}]}]},
-            "line 0: points",
+            r"lines\[0\].points: expected `array` of length >= 2",
         ),
     ],
 )

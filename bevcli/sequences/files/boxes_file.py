@@ -4,12 +4,11 @@ ClassNames: the class names of data sets, compared without case and renamed by a
 """
 
 import math
-import operator
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -21,23 +20,20 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ClassSettings, ObjectClass, object_classes
 from bevcli.geometry.transforms import Array, Pose, inverse
-from bevcli.parsing.documents import TOML_BYTES, parse_toml, without_garbage_collection
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, typed, without_garbage_collection
 from bevcli.parsing.files import read_text
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
 
 FUTURE_DECIMALS = 3  # millimetres
-_Vector = Annotated[tuple[float, float, float], Meta(description="3 numbers")]
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
-_Futures = Annotated[list[_Mode], Meta(min_length=1, description="modes of points [x, y] or null")]
-_Numbers = Annotated[list[float], Meta(description="a list of numbers")]
 # Types of the optional members, by `Column.values`. The range of shares is checked by column.
 _TYPES: dict[str, Any] = {
-    "score": Annotated[float, Meta(ge=0, le=1, description="0 to 1")] | UnsetType,
-    "share": Annotated[float, Meta(description="0 to 1")] | UnsetType | None,
-    "text": Annotated[str, Meta(description="a string")] | UnsetType | None,
-    "flag": Annotated[bool, Meta(description="true or false")] | UnsetType,
-    "count": Annotated[int, Meta(ge=0, description="an integer, 0 or more")] | UnsetType,
+    "score": Annotated[float, Meta(ge=0, le=1)] | UnsetType,
+    "share": float | UnsetType | None,
+    "text": str | UnsetType | None,
+    "flag": bool | UnsetType,
+    "count": Annotated[int, Meta(ge=0)] | UnsetType,
 }
 FORMAT = "bevcli-boxes/1"
 FRAMES_OF_REFERENCE = ("world", "ego", "bev")
@@ -135,14 +131,14 @@ _OWN_NAMES = ClassNames()
 class _FixedMembers(Struct, forbid_unknown_fields=True):
     """A box in JSON without its optional columns. futures: M modes of T steps, each x and y; null if unknown."""
 
-    name: Annotated[str, Meta(min_length=1, description="a name")] = msgspec.field(name="class")
-    center: _Vector
-    size_lwh: _Vector
-    yaw: Annotated[float, Meta(description="a number")]
-    velocity: Annotated[tuple[float | None, float | None], Meta(description="2 numbers")] | None = None
-    futures: _Futures | None = None
-    future_times_s: _Numbers = []
-    future_scores: _Numbers | None = None
+    name: Annotated[str, Meta(min_length=1)] = msgspec.field(name="class")
+    center: tuple[float, float, float]
+    size_lwh: tuple[float, float, float]
+    yaw: float
+    velocity: tuple[float | None, float | None] | None = None
+    futures: Annotated[list[_Mode], Meta(min_length=1)] | None = None
+    future_times_s: list[float] = []
+    future_scores: list[float] | None = None
 
 
 _Box: Any = msgspec.defstruct(
@@ -160,15 +156,9 @@ def boxes_from_json(objects: Any, location: str, class_names: ClassNames = _OWN_
     not know are kept.
     Raises InputError that names the first invalid box by its index in the list.
     """
-    if not isinstance(objects, list):
-        raise InputError(f'{location}: "boxes" must be a list, found {objects!r:.40}')
-    if not objects:
+    rows = typed(objects, list[_Box], f"{location}: boxes")
+    if not rows:
         return Boxes3D.empty()
-    try:
-        rows = msgspec.convert(objects, list[_Box])
-    except msgspec.ValidationError:
-        index, mistake = next(filter(operator.itemgetter(1), enumerate(map(_mistake, objects))))
-        raise InputError(f"{location}: box {index}: {mistake}") from None
     columns: dict[str, NDArray[Any] | None] = {}
     for name, column in OPTIONAL_COLUMNS.items():
         raw = [getattr(row, column.key) for row in rows]
@@ -231,29 +221,6 @@ def boxes_to_json(boxes: Boxes3D) -> list[dict[str, Any]]:
     if boxes.futures is not None:
         _add_futures(objects, boxes, boxes.futures)
     return objects
-
-
-def _mistake(box: Any) -> str:
-    """The first mistake in the object of a box, "" if it is right."""
-    if not isinstance(box, dict):
-        return f"expected an object, found {box!r:.40}"
-    fields = {member.encode_name: member for member in msgspec.structs.fields(_Box)}
-    for key in (key for key, member in fields.items() if member.required and key not in box):
-        return f'"{key}" is missing (found: {", ".join(box)})'
-    for key, value in box.items():
-        if key not in fields:
-            return f'unknown key "{key}" (known: {", ".join(sorted(fields))})'
-        try:
-            msgspec.convert(value, fields[key].type)
-        except msgspec.ValidationError:
-            return f"{key}: expected {_description(fields[key].type)}, found {value!r:.60}"
-    return ""
-
-
-def _description(hint: Any) -> str:
-    """The description in a type, or in one of the types of a union."""
-    notes = [note for argument in (hint, *get_args(hint)) for note in getattr(argument, "__metadata__", ())]
-    return str(notes[0].description)
 
 
 def _add_futures(objects: Sequence[dict[str, Any]], boxes: Boxes3D, futures: Array) -> None:

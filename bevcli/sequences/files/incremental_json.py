@@ -11,9 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
 
+from msgspec import Struct
+
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp
-from bevcli.parsing.documents import parse_json
+from bevcli.parsing.documents import parse_json, typed
 from bevcli.parsing.files import read_bytes
 from bevcli.writing import PARTIAL, output_errors, partial_path
 
@@ -180,12 +182,11 @@ def stamp_to_json(stamp: FrameStamp) -> dict[str, Any]:
 
 def stamp_from_json(entry: Any, location: str) -> FrameStamp:
     """The stamp of an entry of "frames", as `stamp_to_json` makes it. Raises InputError that begins with `location`."""
-    if not isinstance(entry, dict):
-        raise InputError(f"{location}: expected an object, found {entry!r:.40}")
-    for key in ("frame", "timestamp_ns"):
-        if type(entry.get(key)) is not int:
-            raise InputError(f'{location}: "{key}" must be an integer, found {entry.get(key)!r:.40}')
-    scene = entry.get("scene", "")
-    if not isinstance(scene, str):
-        raise InputError(f"{location}: scene: expected a string, found {scene!r:.40}")
-    return FrameStamp(entry["frame"], scene, entry["timestamp_ns"])
+    stated = typed(entry, _Stamp, location)
+    return FrameStamp(stated.frame, stated.scene, stated.timestamp_ns)
+
+
+class _Stamp(Struct):
+    frame: int
+    timestamp_ns: int
+    scene: str = ""

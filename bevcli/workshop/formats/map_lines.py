@@ -7,9 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from shapely import GEOSException, LineString, Polygon, STRtree, box, union_all
 from shapely.affinity import affine_transform
@@ -20,10 +22,9 @@ from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameResult, FrameStamp, Ground, GroundLines
 from bevcli.geometry.object_classes import Color
 from bevcli.geometry.transforms import Array, apply, inverse
-from bevcli.parsing.documents import read_json
+from bevcli.parsing.documents import Number, read_json, typed
 from bevcli.recording.entities import map_colors
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
-from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.sequences.native.folder import LINES_FILE
 from bevcli.workshop.formats.nuscenes_tables import read_rows
 
@@ -132,41 +133,32 @@ def read_lines(path: Path) -> LinesFile:
     """
     content = read_frames(path, FORMAT, "a file of map lines", _FRAMES_OF_REFERENCE)
     reference, classes, rows = (content.pop(key, None) for key in ("frame_of_reference", "classes", "frames"))
-    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
-        raise InputError(f'{path}: "classes" must be a list of names, found {classes!r:.40}')
     frames = tuple(_frame(f"{path}: entry {index} of frames", row) for index, row in enumerate(rows))
     content.pop("format")
-    return LinesFile(reference, tuple(classes), frames, content)
+    return LinesFile(reference, typed(classes, tuple[str, ...], f"{path}: classes"), frames, content)
+
+
+class _Line(Struct):
+    name: str = msgspec.field(name="class")
+    points: Annotated[list[tuple[Number, Number, Number]], Meta(min_length=2)]
+    score: Annotated[float, Meta(ge=0, le=1)] | None = None
+
+
+class _Lines(Struct):
+    lines: list[_Line]
 
 
 def _frame(where: str, row: Any) -> FrameLines:
-    stamp, lines = stamp_from_json(row, where), row.get("lines")
-    if not isinstance(lines, list):
-        raise InputError(f'{where}: expected a list "lines", found {lines!r:.60}')
+    stamp, lines = stamp_from_json(row, where), typed(row, _Lines, where).lines
+    points = tuple(np.array(line.points, dtype=np.float64) for line in lines)
+    scores = [line.score for line in lines if line.score is not None]
     for index, line in enumerate(lines):
-        if not isinstance(line, dict) or not isinstance(line.get("class"), str):
-            raise InputError(f'{where}: line {index}: expected an object with "class" and "points", found {line!r:.60}')
-    points = tuple(_points(line.get("points"), f"{where}: line {index}") for index, line in enumerate(lines))
-    classes = np.array([line["class"] for line in lines], dtype=np.str_)
-    scores = None
-    if any("score" in line for line in lines):
-        scores = np.array([_score(line.get("score"), f"{where}: line {index}") for index, line in enumerate(lines)])
-    return FrameLines(stamp, MapLines(points, classes, scores))
-
-
-def _points(values: Any, where: str) -> np.ndarray:
-    points = array_of_numbers(values)
-    if points is None or points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        raise InputError(f"{where}: points: expected at least two points of x, y, z, found {values!r:.60}")
-    if not np.isfinite(points).all():
-        raise InputError(f"{where}: points: expected finite numbers, found {values!r:.60}")
-    return points
-
-
-def _score(value: Any, where: str) -> float:
-    if type(value) not in (int, float) or not 0 <= value <= 1:
-        raise InputError(f"{where}: score: expected a number from 0 to 1, found {value!r:.40}")
-    return float(value)
+        if not np.isfinite([line.score or 0, *points[index].flat]).all():
+            raise InputError(f"{where}: lines[{index}]: expected finite numbers")
+        if scores and line.score is None:
+            raise InputError(f"{where}: lines[{index}]: has no score, and others have one")
+    classes = np.array([line.name for line in lines], dtype=np.str_)
+    return FrameLines(stamp, MapLines(points, classes, np.array(scores) if scores else None))
 
 
 class TrueLines:

@@ -16,7 +16,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence as Indices
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import BevcliError, InputError
-from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, typed
 from bevcli.parsing.files import MIB, read_text
 from bevcli.printing import aligned, counted, reason_of
 from bevcli.workshop.formats import BAG_METADATA, BAG_SUFFIXES, is_packed_bag
@@ -208,15 +208,10 @@ def read_topics_file(path: Path | None, topics: Mapping[str, str]) -> StatedTopi
         return StatedTopics(renamed=topics)
     document = parse_toml(read_text(path, TOML_BYTES), path)
     names = [entry.name for entry in fields(StatedTopics) if entry.name != "renamed"]
-    for key, value in document.items():
+    for key in document:
         if key not in names:
             raise InputError(f'{path}: unknown key "{key}" (known: {", ".join(names)})')
-        is_table = key in ("cameras", "calibration", "frames")
-        if is_table and not (isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values())):
-            raise InputError(f'{path}: "{key}": expected a table of names, such as CAM_FRONT = "..."')
-        if not (is_table or isinstance(value, str)):
-            raise InputError(f'{path}: "{key}": expected a name, found {value!r:.40}')
-    return StatedTopics(**document, renamed=topics)
+    return replace(typed(document, StatedTopics, path), renamed=topics)
 
 
 @dataclass(frozen=True)
