@@ -217,7 +217,7 @@ class ImageReader:
                     hint = "replace the image, or remove `strict=True` (`--strict`)"
                     raise InputError(f"camera {name}: {unreadable}: {hint}") from None
                 reasons[name] = str(unreadable)
-        if not images and self._inside is not None and not os.path.isdir(self._inside):
+        if not images and self._inside is not None and not os.path.exists(self._inside):
             raise InputError(
                 f"{self._inside}: the folder is gone (expected until the last frame is read): bring it back"
             )

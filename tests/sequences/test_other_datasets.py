@@ -183,11 +183,11 @@ def _assert_refused(folder: Path, file: str) -> None:
 @pytest.mark.parametrize(
     ("column", "values", "expected"),
     [
-        ("k1", ["bent"] * 6, '"k1": expected numbers, found string'),
-        ("k1", [None] * 6, '"k1": expected numbers'),
+        ("k1", ["bent"] * 6, '"k1": expected double, found string'),
+        ("k1", [None] * 6, '"k1": expected double, found null with missing values'),
         ("fx_px", [float("nan")] * 6, "expected finite numbers"),
         ("fx_px", [-1.0] * 6, "expected fx > 0 and fy > 0"),
-        ("width_px", [0.5] * 6, '"width_px": expected integers'),
+        ("width_px", [0.5] * 6, '"width_px": expected int64, found double'),
         ("sensor_name", ["ring_front_center"] * 6, "two of one camera"),
         ("cx_px", None, 'no column "cx_px"'),
     ],

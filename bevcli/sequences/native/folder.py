@@ -36,7 +36,7 @@ IMAGE_TIMES = ("times", "image_rate_hz", "start_ns")  # options of folders witho
 
 
 class FolderDrive(ListedDrive):
-    """A native sequence folder as a `Drive`.
+    """A native sequence folder as a `Drive`, or a video of one camera.
 
     draft: used in place of the rig of `own` and of calibration.json, if given.
     Attribute understood: how the images were understood without frames.csv, "" with it.
@@ -51,7 +51,7 @@ class FolderDrive(ListedDrive):
         own: FolderOptions = FolderOptions(),
         draft: RigDraft | None = None,
     ) -> None:
-        if not path.is_dir():
+        if not path.exists():
             raise InputError(f"{path}: the sequence folder is missing")
         if draft is None:
             draft = draft_of(own, path) or draft_rig(path / CALIBRATION, path).checked(path / CALIBRATION)
@@ -107,7 +107,8 @@ class FolderDrive(ListedDrive):
     @property
     def input_files(self) -> tuple[Path, ...]:
         # Tables and videos, but no images, which are in folders.
-        return tuple(sorted(path for path in self.path.iterdir() if path.is_file()))
+        paths = [self.path] if self.path.is_file() else self.path.iterdir()
+        return tuple(sorted(path for path in paths if path.is_file()))
 
     def _frame(self, position: int, entry: FrameEntry) -> Frame:
         index, time = entry.stamp.index, entry.stamp.timestamp_ns

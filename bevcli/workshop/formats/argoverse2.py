@@ -5,6 +5,7 @@ Argoverse's egovehicle frame is at the rear axle, above the ground. The ego fram
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa  # which rerun brings, so that it is installed anyway
@@ -43,6 +44,8 @@ LARGEST_BYTES = 256 * MIB
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
 QUATERNION, TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+POSE = (*QUATERNION, *TRANSLATION)
+Table = Mapping[str, NDArray[Any]]  # columns by name
 RING = (
     "ring_front_center", "ring_front_right", "ring_front_left", "ring_side_right", "ring_side_left",
     "ring_rear_right", "ring_rear_left",
@@ -55,75 +58,52 @@ SIZE = ("length_m", "width_m", "height_m")
 ANNOTATIONS = "annotations.feather"
 
 
-class FeatherTable:
-    """The columns of a Feather file. Raises InputError where the file is missing or broken, or lacks a column.
+def read_feather(
+    path: Path, *, texts: Iterable[str] = (), integers: Iterable[str] = (), numbers: Iterable[str]
+) -> Table:
+    """The columns of a Feather file, by name. Raises InputError where the file is missing or broken, or lacks a value.
 
-    required: names of columns.
+    texts, integers, numbers: names of columns; numbers are finite.
     """
-
-    def __init__(self, path: Path, required: Iterable[str]) -> None:
-        self.path = path
-        data = read_bytes(path, LARGEST_BYTES)
+    data = read_bytes(path, LARGEST_BYTES)
+    try:
+        table = pa.ipc.open_file(pa.BufferReader(data)).read_all()
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+        raise InputError(f"{path}: is not a complete Feather file ({reason_of(error)[:200]})") from None
+    kinds = {pa.string(): texts, pa.int64(): integers, pa.float64(): numbers}
+    columns: dict[str, NDArray[Any]] = {}
+    for kind, name in ((kind, name) for kind, names in kinds.items() for name in names):
+        if table.column_names.count(name) != 1:
+            raise InputError(f'{path}: has no column "{name:.60}" (found: {", ".join(table.column_names[:20]):.200})')
+        column = table[name]
+        is_sound = not column.null_count and pa.types.is_string(kind) == (not pa.types.is_primitive(column.type))
         try:
-            self._table = pa.ipc.open_file(pa.BufferReader(data)).read_all()
-            self._table.validate(full=True)
-        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-            raise InputError(f"{path}: is not a complete Feather file ({reason_of(error)[:200]})") from None
-        for name in required:
-            if self._table.column_names.count(name) != 1:
-                columns = ", ".join(self._table.column_names[:20])
-                raise InputError(f'{path}: has no column "{name:.60}" (found: {columns:.200})')
-
-    def __len__(self) -> int:
-        return int(self._table.num_rows)
-
-    def numbers(self, names: Iterable[str]) -> Array:
-        """(N, C) finite values of columns of numbers. Raises InputError."""
-        return np.stack([self._numbers(name) for name in names], axis=1)
-
-    def integers(self, name: str) -> NDArray[np.int64]:
-        """(N,) values of a column of integers. Raises InputError."""
-        column = self._table[name]
-        if not pa.types.is_integer(column.type) or column.null_count:
-            raise self._error(name, "integers", column)
-        try:
-            return column.cast(pa.int64()).to_numpy().astype(np.int64)
+            columns[name] = (column.cast(kind) if is_sound else pa.array([])).to_numpy()
         except pa.ArrowException:
-            raise self._error(name, "integers of at most 63 bits", column) from None
+            is_sound = False
+        if not is_sound:
+            found = f"{column.type}{' with missing values' if column.null_count else ''}"
+            raise InputError(f'{path}: column "{name}": expected {kind}, found {found:.80}')
+        if kind == pa.float64() and not (is_finite := np.abs(columns[name]) < LARGEST_NUMBER).all():
+            row = int(is_finite.argmin())
+            found = f"{columns[name][row]:g} in row {row}"
+            raise InputError(f'{path}: column "{name}": expected finite numbers below 1e12, found {found}')
+    return columns
 
-    def texts(self, name: str) -> list[str]:
-        """(N) values of a column of texts. Raises InputError."""
-        column = self._table[name]
-        try:
-            texts = column.cast(pa.string()).to_pylist()
-        except pa.ArrowException:
-            raise self._error(name, "texts", column) from None
-        if column.null_count or any(len(text) > 200 for text in texts):
-            raise self._error(name, "texts of at most 200 characters", column)
-        return [str(text) for text in texts]
 
-    def poses(self) -> tuple[Array, Array]:
-        """(N, 3) translations, metres, and (N, 4) quaternions w, x, y, z of norm 1. Raises InputError."""
-        quaternions = self.numbers(QUATERNION)
-        norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
-        if not (norms > SHORTEST_QUATERNION).all():
-            raise InputError(f"{self.path}: expected quaternions of norm 1, found one of norm 0")
-        return self.numbers(TRANSLATION), quaternions / norms
+def _stacked(table: Table, names: Iterable[str]) -> Array:
+    """(N, C) columns of numbers."""
+    return np.stack([table[name] for name in names], axis=1)
 
-    def _numbers(self, name: str) -> Array:
-        column = self._table[name]
-        if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)) or column.null_count:
-            raise self._error(name, "numbers", column)
-        values = column.to_numpy().astype(np.float64)
-        wrong = np.flatnonzero(~(np.abs(values) < LARGEST_NUMBER))
-        if len(wrong):
-            description = f"{values[wrong[0]]:g} in row {wrong[0]}"
-            raise InputError(f'{self.path}: column "{name}": expected finite numbers below 1e12, found {description}')
-        return values
 
-    def _error(self, name: str, expected: str, column: pa.ChunkedArray) -> InputError:
-        description = f"{column.type}{' with missing values' if column.null_count else ''}"
-        return InputError(f'{self.path}: column "{name}": expected {expected}, found {description:.80}')
+def _poses(table: Table, path: Path) -> tuple[Array, Array]:
+    """(N, 3) translations, metres, and (N, 4) quaternions w, x, y, z of norm 1. Raises InputError."""
+    quaternions = _stacked(table, QUATERNION)
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    if not (norms > SHORTEST_QUATERNION).all():
+        raise InputError(f"{path}: expected quaternions of norm 1, found one of norm 0")
+    return _stacked(table, TRANSLATION), quaternions / norms
 
 
 def open_log(path: Path, common: InputOptions, options: Argoverse2Options) -> ListedDrive:
@@ -149,11 +129,11 @@ def open_log(path: Path, common: InputOptions, options: Argoverse2Options) -> Li
 
 def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
     """The poses in city_SE3_egovehicle.feather, as those of the frame below the axle. Raises InputError."""
-    table = FeatherTable(path, ("timestamp_ns", *QUATERNION, *TRANSLATION))
-    if not len(table):
+    table = read_feather(path, integers=["timestamp_ns"], numbers=POSE)
+    times, first = np.unique(table["timestamp_ns"], return_index=True)
+    if not len(times):
         raise InputError(f"{path}: has no poses (expected at least one)")
-    times, first = np.unique(table.integers("timestamp_ns"), return_index=True)
-    axles, quaternions = (column[first] for column in table.poses())
+    axles, quaternions = (column[first] for column in _poses(table, path))
     up = rotation_from_quaternion(quaternions)[..., 2]
     poses = (times, axles - axle_height_m * up, quaternions)
     rows = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + 1, SPACING_NS)))
@@ -162,12 +142,12 @@ def _read_motion(path: Path, axle_height_m: float) -> EgoMotion:
 
 def _read_rig(folder: Path, options: Argoverse2Options) -> CameraRig:
     path, poses_path = folder / "intrinsics.feather", folder / "egovehicle_SE3_sensor.feather"
-    table = FeatherTable(path, ("sensor_name", *LENS, "width_px", "height_px"))
-    lenses = dict(zip(table.texts("sensor_name"), table.numbers(LENS), strict=True))
-    sizes = np.stack([table.integers("width_px"), table.integers("height_px")], axis=1)
-    size_of = dict(zip(lenses, sizes.tolist(), strict=True)) if len(lenses) == len(table) else {}
-    poses = FeatherTable(poses_path, ("sensor_name", *QUATERNION, *TRANSLATION))
-    axle_from = dict(zip(poses.texts("sensor_name"), map(Pose, *poses.poses()), strict=True))
+    table = read_feather(path, texts=["sensor_name"], integers=["width_px", "height_px"], numbers=LENS)
+    lenses = dict(zip(table["sensor_name"], _stacked(table, LENS), strict=True))
+    sizes = _stacked(table, ("width_px", "height_px")).tolist()
+    size_of = dict(zip(lenses, sizes, strict=True)) if len(lenses) == len(sizes) else {}
+    poses = read_feather(poses_path, texts=["sensor_name"], numbers=POSE)
+    axle_from = dict(zip(poses["sensor_name"], map(Pose, *_poses(poses, poses_path)), strict=True))
     names = [name for name in RING if name in lenses] + (list(STEREO) if options.stereo else [])
     if not names:
         raise InputError(f"{path}: has none of the ring cameras (expected {RING[0]} and others)")
@@ -202,19 +182,19 @@ def _images(folder: Path) -> CameraImages:
 def _read_annotations(
     path: Path, motion: EgoMotion, options: Argoverse2Options, names: ClassNames
 ) -> dict[int, Boxes3D]:
-    columns = ("timestamp_ns", "track_uuid", "category", *SIZE, *QUATERNION, *TRANSLATION, "num_interior_pts")
-    table = FeatherTable(path, columns)
-    translations, quaternions = table.poses()
+    texts, integers = ("track_uuid", "category"), ("timestamp_ns", "num_interior_pts")
+    table = read_feather(path, texts=texts, integers=integers, numbers=(*SIZE, *POSE))
+    translations, quaternions = _poses(table, path)
+    times = table["timestamp_ns"]
     boxes = Boxes3D(
         translations + [0, 0, options.axle_height_m],
-        table.numbers(SIZE),
+        _stacked(table, SIZE),
         np.array([yaw_of_rotation(rotation_from_quaternion(q)) for q in quaternions], dtype=np.float64),
-        np.full((len(table), 2), np.nan),
-        np.array([names[name] for name in table.texts("category")], dtype=np.str_),
-        instances=np.array(table.texts("track_uuid"), dtype=np.str_),
-        num_points=table.integers("num_interior_pts"),
+        np.full((len(times), 2), np.nan),
+        np.array([names[name] for name in table["category"]], dtype=np.str_),
+        instances=table["track_uuid"].astype(np.str_),
+        num_points=table["num_interior_pts"],
     )
-    times = table.integers("timestamp_ns")
     frames = np.unique(times)
     try:
         in_city = [boxes[times == time].transformed(motion.pose_at(int(time)).matrix) for time in frames]

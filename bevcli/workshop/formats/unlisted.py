@@ -28,6 +28,7 @@ from bevcli.workshop.formats.matching import (
     CameraImages,
     Found,
     folder_of_images,
+    frames_at,
     match,
     match_names,
     measured_periods,
@@ -97,10 +98,13 @@ def find_frames(
 ) -> Found:
     """The frames in `images/CAMERA/*`, `CAMERA/*` or `videos/CAMERA.*`, and a note that tells how they were understood.
 
+    folder: or the video of the only camera.
     motion: the poses, which decide where the names of images have two readings. None where they are not known yet.
     has_poses: there are poses, for which the rate of numbered images must be known.
     Raises InputError if there are no images, or their times are not known.
     """
+    if folder.is_file():
+        return _from_video(folder, cameras[0], own)
     timing = read_timing(folder, cameras, own)
     if (folder / "images").is_dir():
         entries, line = _from_names(folder / "images", timing, motion, has_poses)
@@ -270,6 +274,15 @@ def _times_of_indices(
     assumed = "" if rate else " (assumed: state `image_rate_hz` (`--image-rate`))"
     start, rate = timing.start_ns or 0, rate or ASSUMED_RATE_HZ
     return [start + round((number - first) * 1e9 / rate) for number in numbers], f"at {rate:g} Hz{assumed}"
+
+
+def _from_video(path: Path, camera: str, own: FolderOptions) -> Found:
+    """A frame for each image of a video, and what was understood."""
+    video = video_images(path, own.start_ns or 0, own.image_rate_hz)
+    entries = frames_at(video.times_ns, {camera: video}, camera)
+    start = "time 0 (state `start_ns` (`--start-ns`))" if own.start_ns is None else f"{own.start_ns} ns"
+    rate = f"{UNEVEN_TEXT}," if video.is_uneven else f"at {1e9 / video.period_ns:g} Hz"
+    return entries, f"{len(entries)} images {rate} from {start} on"
 
 
 def _from_videos(folder: Path, timing: Timing) -> Found:
