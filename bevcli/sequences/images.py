@@ -350,15 +350,21 @@ class ListedDrive(Drive):
         return count_classes(self._truth.values())
 
     def image_files(self, index: int) -> tuple[Path, ...]:
-        sources = self._entries[index].sources.values()
+        sources = self._entry(index).sources.values()
         return tuple(source.path for source in sources if isinstance(source, ImageSource))
 
     def ground_truth_frame(self, index: int) -> Frame:
-        entry = self._entries[index]  # its reasons for missing images are left out: `strict` refuses them
+        entry = self._entry(index)  # its reasons for missing images are left out: `strict` refuses them
         return self._frame(index, FrameEntry(entry.stamp, {}, {}, entry.origin))
 
     def load(self, index: int) -> Frame:
-        return self._frame(index, self._entries[index])
+        return self._frame(index, self._entry(index))
+
+    def _entry(self, index: int) -> FrameEntry:
+        return self._entries[index]
+
+    def _rig_and_motion(self, index: int) -> tuple[CameraRig, EgoMotion | None]:
+        return self._rigs[index], self.ego_motion
 
     def _frame(self, index: int, entry: FrameEntry) -> Frame:
         """The frame at a place, of its entry or of one without images.
@@ -366,7 +372,7 @@ class ListedDrive(Drive):
         Without ego-motion, poses are the identity, and the vehicle is at rest.
         Raises InputError as `ImageReader.read`, and for a time that the ego-motion does not cover.
         """
-        rig, motion, frame_ns = self._rigs[index], self.ego_motion, entry.stamp.timestamp_ns
+        (rig, motion), frame_ns = self._rig_and_motion(index), entry.stamp.timestamp_ns
         images, dropped = self._images.read(entry.sources, rig, entry.dropped)
         times = dict.fromkeys(rig.names, frame_ns)
         times |= {name: source.timestamp_ns for name, source in entry.sources.items()}

@@ -1,16 +1,17 @@
 """A nuScenes root or a T4 dataset as a drive, with the rig, the poses and the CAN bus data of each scene."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.frame import Drive, Frame, FrameStamp
+from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, brown_conrady, default_ego_from_bev
 from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose
@@ -18,7 +19,7 @@ from bevcli.parsing.files import is_there
 from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import Format
-from bevcli.sequences.images import ImageReader, ImageSource, bev_frame_notes
+from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, ListedDrive, bev_frame_notes
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.formats.map_lines import MapExpansion
@@ -79,17 +80,15 @@ class CanBus:
         return Kinematics(self.accelerations[row], self.angular_rates[row], self.velocities[row])
 
 
-@dataclass(frozen=True)
-class _FrameEntry:
-    """A frame before its images are read. scene, sample and rows of images: in the index. sample: None for a sweep."""
+class _Place(NamedTuple):
+    """A frame in the index: its scene, its sample (None for a sweep), and the rows of its images."""
 
-    stamp: FrameStamp
     scene: int
     sample: int | None
     rows: Ints
 
 
-class TableDrive(Drive):
+class TableDrive(ListedDrive):
     """Frames of a folder with nuScenes' tables, scene after scene, numbered from 0.
 
     Args:
@@ -107,12 +106,17 @@ class TableDrive(Drive):
     def __init__(self, root: Path, tables: Path, common: InputOptions, dialect: Dialect, own: NuScenesOptions) -> None:
         common.refuse_static(root)
         self.name = root.resolve().name
-        self.root, self.tables, self.dialect = root, tables, dialect
+        self.path, self.tables, self.dialect = root, tables, dialect
         self.index, note = open_index(tables, dialect)
         self.scenes = chosen_scenes(self.index, tables, own.split, common.scene)
         self.rig = scene_rig(self.index, dialect, self.scenes[0], tables)
-        self._frames = tuple(self._find_frames(own.sweeps))
-        self.stamps = tuple(entry.stamp for entry in self._frames)
+        find = sweep_frames if own.sweeps else keyframes
+        found = [(scene, *frame) for scene in self.scenes for frame in find(self.index, scene)]
+        names = [str(name) for name in self.index.scenes.names]
+        times = [(names[scene], time_us * 1000) for scene, time_us, _, _ in found]
+        self.stamps = tuple(FrameStamp(number, *time) for number, time in enumerate(times))
+        self._places = tuple(_Place(scene, sample, rows) for scene, _, sample, rows in found)
+        self._truth = {}
         self._images = ImageReader(strict=common.strict, inside=None if common.allow_outside else root)
         self._scene = lru_cache(maxsize=2)(self._read_scene)
         self.notes = (*((note,) if note else ()), *bev_frame_notes(self.rig, str(tables)), *self._table_notes())
@@ -140,7 +144,7 @@ class TableDrive(Drive):
     def class_counts(self) -> Mapping[str, int]:
         first, categories = self.index.samples.first_annotation, self.index.annotations.categories
         by_category: Counter[bytes] = Counter()
-        for sample in (entry.sample for entry in self._frames if entry.sample is not None):
+        for sample in (place.sample for place in self._places if place.sample is not None):
             by_category.update(categories[first[sample] : first[sample + 1]].tolist())
         counts: Counter[str] = Counter()
         for category, count in by_category.items():
@@ -148,54 +152,34 @@ class TableDrive(Drive):
                 counts[name] += count
         return counts
 
-    def image_files(self, index: int) -> tuple[Path, ...]:
-        return tuple(self._source(int(row)).path for row in self._frames[index].rows)
+    def _entry(self, index: int) -> FrameEntry:
+        """The frame and its images: those of all frames would fill the memory."""
+        rig, images, rows = self._scene(self._places[index].scene)[0], self.index.images, self._places[index].rows
+        found = {
+            str(name): ImageSource(self.path / images.files[row].decode(), int(images.times_us[row]) * 1000)
+            for name, row in zip(self.index.sensors.channels[images.sensors[rows]], rows, strict=True)
+        }
+        sources = {name: found[name] for name in rig.names if name in found}
+        dropped = {name: "no image in sample_data.json" for name in rig.names if name not in found}
+        return FrameEntry(self.stamps[index], sources, dropped, str(self.tables))
 
-    def ground_truth_frame(self, index: int) -> Frame:
-        return self._frame(self._frames[index], with_images=False)
+    def _rig_and_motion(self, index: int) -> tuple[CameraRig, EgoMotion]:
+        return self._scene(self._places[index].scene)[:2]
 
-    def load(self, index: int) -> Frame:
-        return self._frame(self._frames[index], with_images=True)
+    def _frame(self, index: int, entry: FrameEntry) -> Frame:
+        frame, place = super()._frame(index, entry), self._places[index]
+        can_bus = self._scene(place.scene)[2]
+        if can_bus is not None:
+            frame = replace(frame, kinematics=can_bus.kinematics_at(entry.stamp.timestamp_ns))
+        if place.sample is None:
+            return frame
+        truth = self.index.ground_truth(place.sample, self.dialect)
+        return replace(frame, ground_truth=truth, sample_token=self.index.samples.tokens[place.sample].decode())
 
-    def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
-        rig, motion, kinematics = self._scene(entry.scene)
-        names = self.index.sensors.channels[self.index.images.sensors[entry.rows]]
-        rows = {str(name): int(row) for name, row in zip(names, entry.rows, strict=True)}
-        dropped = {name: "no image in sample_data.json" for name in rig.names if name not in rows}
-        sources = {name: self._source(rows[name]) for name in rig.names if name in rows and with_images}
-        images, dropped = self._images.read(sources, rig, dropped)
-        sample, index = entry.sample, self.index
-        pose = motion.pose_at(entry.stamp.timestamp_ns) if sample is None else _pose_of(index.samples, sample)
-        return Frame(
-            stamp=entry.stamp,
-            rig=rig,
-            images=images,
-            world_from_ego=pose,
-            world_from_ego_at={n: _pose_of(index.images, rows[n]) if n in rows else pose for n in rig.names},
-            kinematics=kinematics.kinematics_at(entry.stamp.timestamp_ns),
-            dropped=dropped,
-            road_normal=motion.road_normal_at(entry.stamp.timestamp_ns),
-            ground_truth=None if sample is None else index.ground_truth(sample, self.dialect),
-            sample_token=None if sample is None else index.samples.tokens[sample].decode(),
-        )
-
-    def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | EgoMotion]:
-        """Rig, poses and kinematics of a scene, by its row in the index; kinematics of the CAN bus, or of the poses."""
+    def _read_scene(self, scene: int) -> tuple[CameraRig, EgoMotion, CanBus | None]:
+        """Rig, poses and CAN bus of a scene, by its row in the index."""
         rig, motion = scene_rig(self.index, self.dialect, scene, self.tables), scene_motion(self.index, scene)
-        return rig, motion, read_can_bus(self.root, str(self.index.scenes.names[scene])) or motion
-
-    def _find_frames(self, sweeps: bool) -> Iterable[_FrameEntry]:
-        number = 0
-        for scene in self.scenes:
-            frames = sweep_frames(self.index, scene) if sweeps else keyframes(self.index, scene)
-            name = str(self.index.scenes.names[scene])
-            for time_us, sample, rows in frames:
-                yield _FrameEntry(FrameStamp(number, name, time_us * 1000), scene, sample, rows)
-                number += 1
-
-    def _source(self, row: int) -> ImageSource:
-        images = self.index.images
-        return ImageSource(self.root / images.files[row].decode(), int(images.times_us[row]) * 1000)
+        return rig, motion, read_can_bus(self.path, str(self.index.scenes.names[scene]))
 
 
 class NuScenesDrive(TableDrive):
@@ -217,18 +201,18 @@ class NuScenesDrive(TableDrive):
         note = self._can_bus_note()
         self.notes = (*self.notes, note) if note else self.notes
 
-    def _frame(self, entry: _FrameEntry, *, with_images: bool) -> Frame:
-        frame = super()._frame(entry, with_images=with_images)
-        lines = self._true_lines(frame) if self._true_lines and entry.sample is not None else None
+    def _frame(self, index: int, entry: FrameEntry) -> Frame:
+        frame = super()._frame(index, entry)
+        lines = self._true_lines(frame) if self._true_lines and self._places[index].sample is not None else None
         return frame if lines is None else replace(frame, ground_truth_results=(lines,))
 
     def _can_bus_note(self) -> str:
         names = [str(self.index.scenes.names[scene]) for scene in self.scenes]
-        without = [name for name in names if not (self.root / "can_bus" / f"{name}_pose.json").is_file()]
+        without = [name for name in names if not (self.path / "can_bus" / f"{name}_pose.json").is_file()]
         if not without:
             return ""
         which = without[0] if len(without) == 1 else f"{len(without)} of {len(names)} scenes"
-        return f"{which}: no CAN bus data in {self.root / 'can_bus'}; kinematics are derived from the poses"
+        return f"{which}: no CAN bus data in {self.path / 'can_bus'}; kinematics are derived from the poses"
 
 
 def _pose_of(table: Images | Samples | Sensors, row: int) -> Pose:
