@@ -26,6 +26,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     if getattr(numba.config, "DISABLE_JIT"):  # noqa: B009, an attribute that numba makes at run time
         raise BevcliError("NUMBA_DISABLE_JIT is set: unset it, because the functions here run compiled only")
 
+    options["no_cfunc_wrapper"] = True  # nobody calls compiled functions from C
+
     def compiled(function: Callable[..., Any]) -> Any:
         for is_cached in (lambda: True, _temporary_cache):
             try:

@@ -109,7 +109,7 @@ def rasterise_meshes(world, meshes, camera_from_world, pinhole, eye,
             _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_objects, unoccluded)
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True)
 def _transform(matrix, point, out):
     """Write a point (3 or more,) transformed by a matrix (3, 4) to `out` (3,)."""
     for axis in range(3):
@@ -144,23 +144,22 @@ def _draw_triangle(p, cut, t, owner, pinhole, triangles, inverse_depth, last_obj
 
     cut: (4, 3) working memory. owner: the triangle's object, -1 for none.
     """
-    if p[0, 2] >= NEAR_M and p[1, 2] >= NEAR_M and p[2, 2] >= NEAR_M:
-        _fill(p, p, 0, 1, 2, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
-        return
-    count = 0
-    for i in range(3):  # Sutherland-Hodgman against the near plane
-        j = (i + 1) % 3
-        if p[i, 2] >= NEAR_M:
-            for axis in range(3):
-                cut[count, axis] = p[i, axis]
-            count += 1
-        if (p[i, 2] >= NEAR_M) != (p[j, 2] >= NEAR_M):
-            w = (NEAR_M - p[i, 2]) / (p[j, 2] - p[i, 2])
-            for axis in range(3):
-                cut[count, axis] = p[i, axis] + w * (p[j, axis] - p[i, axis])
-            count += 1
+    q, count = p, 3
+    if p[0, 2] < NEAR_M or p[1, 2] < NEAR_M or p[2, 2] < NEAR_M:
+        q, count = cut, 0
+        for i in range(3):  # Sutherland-Hodgman against the near plane
+            j = (i + 1) % 3
+            if p[i, 2] >= NEAR_M:
+                for axis in range(3):
+                    cut[count, axis] = p[i, axis]
+                count += 1
+            if (p[i, 2] >= NEAR_M) != (p[j, 2] >= NEAR_M):
+                w = (NEAR_M - p[i, 2]) / (p[j, 2] - p[i, 2])
+                for axis in range(3):
+                    cut[count, axis] = p[i, axis] + w * (p[j, axis] - p[i, axis])
+                count += 1
     for i in range(1, count - 1):
-        _fill(p, cut, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
+        _fill(p, q, 0, i, i + 1, pinhole, t, owner, triangles, inverse_depth, last_objects, unoccluded)
 
 
 @njit(nogil=True, error_model="numpy")
@@ -212,7 +211,7 @@ def _fill(p, q, a, b, c, pinhole, t, owner, triangles, inverse_depth, last_objec
                 triangles[v, u] = t
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True, error_model="numpy")
 def _narrow(low, high, slope, needed, origin):
     """The part of the interval [low, high] where slope * (u - origin) >= needed."""
     if slope > 0:

@@ -90,7 +90,7 @@ def shade_pixels(buffer, surfaces, ground, shadows, weather, view, table, needed
             _put(image, v, u, a, table, table_scale)
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True, error_model="numpy")
 def pixel_ray(ray_from_image, u, v):
     """The world ray of a pixel, with depth 1: x, y, z and length."""
     rx = ray_from_image[0, 0] * u + ray_from_image[0, 1] * v + ray_from_image[0, 2]
@@ -118,7 +118,7 @@ def _veil(color, haze, far):
         color[c] += (haze[c] - color[c]) * veil
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True, error_model="numpy")
 def _put(image, v, u, color, table, scale):
     """Write a colour (3,) to a pixel. scale: entries of the table for each unit of light."""
     for c in range(3):
@@ -144,7 +144,7 @@ def _sky(x, y, z, light, to_sun, clouds, out):
         out[c] = base + (cloud[c] - base) * cover + glow * light[0, c]
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True, error_model="numpy")
 def _repeated(texture, u, v):
     """Linear interpolation of a texture (S, S), S a power of 2, that repeats in both directions, at column u, row v."""
     size = texture.shape[0]
@@ -392,7 +392,7 @@ def _shop(u, z, length, shop_m, seed, out):
     return True
 
 
-@njit(nogil=True, inline="always")
+@njit(nogil=True, error_model="numpy")
 def _hash(a, b):
     h = (a * 73856093) ^ (b * 19349663)
     h = (h ^ (h >> 13)) * 1274126177
