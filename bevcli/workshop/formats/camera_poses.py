@@ -45,6 +45,7 @@ Fields: TypeAlias = dict[str, Any]
 PAIR = "rig_axes", "camera_axes"
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
 AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
+AXES_FROM_OPTICAL = {name: inverse(rigid(rotation=rotation)) for name, rotation in AXES.items()}  # (4, 4)
 # Axes of the vehicle and of the cameras: usual ones, and others, both right-handed or both left-handed.
 USUAL_CAMERAS = "optical", "vehicle"
 USUAL = tuple(product(USUAL_AXES, USUAL_CAMERAS))
@@ -88,7 +89,7 @@ class StatedPose:
                 return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
         body_from_axes = matrix if states["transform"] == "ego_from_camera" else inverse(matrix)
         ego_from_body = rigid(rotation=ego_from_axes(states["rig_axes"]))
-        return ego_from_body @ body_from_axes @ inverse(rigid(rotation=AXES[states["camera_axes"]])) @ then
+        return ego_from_body @ body_from_axes @ AXES_FROM_OPTICAL[states["camera_axes"]] @ then
 
     @property
     def any_matrix(self) -> Array:

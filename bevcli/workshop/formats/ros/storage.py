@@ -9,7 +9,7 @@ import struct
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from mcap.summary import Summary
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.store import TypesysError
+from rosbags.typesys.store import Typestore, TypesysError
 
 from bevcli.errors import InputError
 from bevcli.parsing.documents import parse_json
@@ -330,15 +330,21 @@ def _cdr(topic: Topic) -> Decode:
     name = topic.type_name if "/msg/" in topic.type_name else topic.type_name.replace("/", "/msg/")
     text = topic.definition.decode(errors="replace")
     try:
-        store = get_typestore(Stores.EMPTY if text else Stores.LATEST)
-        if text:
-            is_idl = topic.schema == "ros2idl"
-            store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
-        store.get_msgdef(name)
+        store = _types(name, text, topic.schema == "ros2idl")
     except (TypesysError, KeyError, ValueError) as error:
         cause = "its definition cannot be read" if text else "the bag has no definition of it, and it is not a ROS type"
         raise InputError(f"{topic.name}: type {name}: {cause} ({error})") from None
     return lambda data: store.deserialize_cdr(data, name)
+
+
+@lru_cache(maxsize=64)
+def _types(name: str, text: str, is_idl: bool) -> Typestore:
+    """The type with this name and definition, which most topics of images share. It is compiled on first use."""
+    store = get_typestore(Stores.EMPTY if text else Stores.LATEST)
+    if text:
+        store.register(get_types_from_idl(text) if is_idl else get_types_from_msg(text, name))
+    store.get_msgdef(name)
+    return store
 
 
 def _json(topic: Topic) -> Decode:
