@@ -193,6 +193,7 @@ def draw_images(frame: RecordedFrame, layout: tuple[Tile, ...], images: Recorded
         part[:] = image[: tile.height, : tile.width]
         camera, size = entities.camera(tile.camera), max(drawing.SMALL_TEXT, tile.width * drawing.LABEL_SHARE)
         boxes = [entities.overlay(tile.camera, "boxes"), *(entities.layer(camera, name) for name in _layers(frame))]
+        draw_strips(part, frame, entities.overlay(tile.camera, entities.IMAGE_BOXES), np.asarray)
         for entity in boxes:
             draw_strips(part, frame, entity, np.asarray, 1 + tile.width // 800)
         for entity in boxes:  # all of a label is in the image

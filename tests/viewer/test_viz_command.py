@@ -4,6 +4,7 @@ import csv
 import json
 import resource
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 from command_line import invoked
 from memory_drive import MemoryDrive, make_camera
-from recorded_drive import bev_from_world, boxes_ahead, record
+from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record
 
 from bevcli.errors import InputError, OutputError
+from bevcli.geometry.boxes import Boxes2D
 from bevcli.geometry.cameras import CameraRig, default_ego_from_bev
 from bevcli.geometry.transforms import apply
 from bevcli.recording import RecordingOptions
+from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_table import COLUMNS
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop import video
@@ -135,7 +138,11 @@ def test_a_video_of_the_images_has_them_and_their_boxes_alone(tmp_path):
     """Two cameras of other sizes look ahead; at 40 frames a second. A car stands 12 m ahead."""
     cameras = (make_camera("LEFT", 20, 201, 120), make_camera("RIGHT", -20, 320, 180))
     rig, path = CameraRig(cameras, default_ego_from_bev()), tmp_path / "r.rrd"
-    record(path, MemoryDrive(3, rig=rig, step_s=1 / 40))
+    drive, person = MemoryDrive(3, rig=rig, step_s=1 / 40), np.array([[10.0, 10, 60, 100]])
+    in_image = {"LEFT": Boxes2D(person, np.array(["person"]), np.array([0.9]))}
+    with Recording(path, drive, NamedModel()) as recording:
+        for frame in map(drive.load, range(3)):
+            recording.log(frame, replace(predict(frame), image_boxes=in_image))
     viz(path, "--video", tmp_path / "v.mp4", "--view", "images")
     written = cv2.VideoCapture(str(tmp_path / "v.mp4"))
     assert written.get(cv2.CAP_PROP_FPS) == pytest.approx(40)
@@ -148,4 +155,5 @@ def test_a_video_of_the_images_has_them_and_their_boxes_alone(tmp_path):
     assert (canvas[:, 201:521][drawn] == (44, 158, 255)).all(-1).any()  # the car's orange, BGR
     assert drawn.mean() < 0.1
     assert not drawn[150:].any()
+    assert (canvas[12:98, 10] != images.image(frame, "LEFT")[12:98, 10]).any(-1).all()  # what a detector sees
     assert "only valid with --video" in invoked("viz", path, "--view", "images", code=2).output
