@@ -99,7 +99,7 @@ def run(
     if run_options.score_without_labels:
         from bevcli.workshop.trust import estimate
 
-        found = estimate.agreement_of_run(out, drive)
+        found = estimate.agreement_of_boxes(out, drive)
         say(replace(found, findings=estimate.find_faults(loaded, drive)).table())
     if signals.received() and not summary.is_complete:
         say(f"stopped; `--resume` goes on with frame {summary.frames + 1} of {len(drive.stamps)}", err=True)

@@ -233,8 +233,10 @@ def read_csv(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = 
     return tuple(csv_rows(path, required, optional))
 
 
-def csv_rows(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = ()) -> Iterator[CsvRow]:
-    """The rows of a CSV file with a header (UTF-8, separated by commas), at least one, while it is parsed.
+def csv_rows(
+    path: Path, required: tuple[str, ...], optional: tuple[str, ...] = (), *, may_be_empty: bool = False
+) -> Iterator[CsvRow]:
+    """The rows of a CSV file with a header (UTF-8, separated by commas), at least one by default, while it is parsed.
 
     Raises InputError if the file cannot be read, a required column is missing, a column is unknown or repeated, a row
     has another number of cells than the header, or there are no rows.
@@ -265,7 +267,7 @@ def csv_rows(path: Path, required: tuple[str, ...], optional: tuple[str, ...] = 
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as text ({error})") from None
-    if is_empty:
+    if is_empty and not may_be_empty:
         raise InputError(f"{path}: the table has no rows below the header (expected at least one)")
 
 

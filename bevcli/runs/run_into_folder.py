@@ -344,7 +344,7 @@ def run_in_folder(
                 if options.score_without_labels:
                     from bevcli.workshop.trust.estimate import witnessed
 
-                    steps = witnessed(steps, drive)
+                    steps = ((frame, witnessed(frame, one, drive), after) for frame, one, after in steps)
                 with contextlib.closing(write_behind(steps, files.write)) as frames:
                     yield FolderRun(frames, done if state.files else 0, summary)
             if summary.is_complete and len(summary.counts.skipped) == summary.frames:

@@ -37,7 +37,7 @@ from bevcli.workshop.batch.job import SCORE_BINS, BatchDrive, Job, Record, fetch
 from bevcli.workshop.batch.report import MATCHES, DriveMatches
 from bevcli.workshop.formats import NuScenesOptions
 from bevcli.workshop.scores.evaluate import Scores, evaluate
-from bevcli.workshop.trust.estimate import agreement_of_run
+from bevcli.workshop.trust.estimate import agreement_of_boxes
 from bevcli.writing import remove_abandoned
 
 _SCRATCH = "bevcli-batch-"
@@ -121,7 +121,7 @@ class Worker:
             content: dict[str, Any] = summary.to_dict()
             agreement = {}
             if scores is None:
-                found = agreement_of_run(aside, sequence)  # with the witness, which needs no ground truth
+                found = agreement_of_boxes(aside, sequence)  # with the witness, which needs no ground truth
                 values = {"agreement": found.score, "agreement_low": found.low, "agreement_high": found.high}
                 agreement = {name: None if value is None else round(value, 4) for name, value in values.items()}
             record = {

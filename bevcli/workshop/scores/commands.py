@@ -94,11 +94,11 @@ def _print_agreement(
     as_json: bool,
 ) -> "Agreement":
     """Print how well boxes agree with a detector in the images of a drive without ground truth."""
-    from bevcli.workshop.scores.inputs import open_predictions
     from bevcli.workshop.trust.estimate import agreement_of_boxes, as_document
 
-    file = open_predictions(predictions, source.class_map)
     drive = bevcli.open_sequence(path, replace(source, ego_motion="optional"), **format_options)
-    found = agreement_of_boxes(file.boxes, drive, file.range_m, worst=worst)
+    # Not what a run saw, which may be of another part of the drive.
+    file = predictions / "predictions.json" if predictions.is_dir() else predictions
+    found = agreement_of_boxes(file, drive, source.class_map, worst)
     say(json.dumps(as_document(found, [(drive.name, found)]), indent=1) if as_json else found.table())
     return found

@@ -6,7 +6,7 @@ that of our boxes to theirs. Without frames half a second apart, kept counts as 
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,12 +15,12 @@ from scipy.optimize import linear_sum_assignment
 
 from bevcli.errors import Finding
 from bevcli.frame import Frame, FrameStamp
-from bevcli.geometry.boxes import Boxes2D, Boxes3D
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import SHOWN_SCORE, ObjectClass
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.scores.evaluate import finite
 from bevcli.workshop.scores.tables import Cell, Table
-from bevcli.workshop.trust.sightings import GROUPS, NOTHING, PARTNER, Sightings, sightings
+from bevcli.workshop.trust.sightings import GROUPS, NOTHING, PARTNER, Seen, Sightings, sightings
 
 LEAST_S, MOST_S, MOST_M_S = 0.4, 1.5, 8.0  # between frames that are compared; error of a velocity that counts 0
 MARGIN_M = 4.0  # a box so near to the end of the range may leave it
@@ -45,7 +45,7 @@ class FrameAgreement:
     @property
     def differences(self) -> int:
         """Number of objects and of boxes without a partner."""
-        return int(sum((side.overlaps[side.counted] < PARTNER).sum() for side in (self.ours, self.theirs)))
+        return int(sum((side["overlap"][side["counted"]] < PARTNER).sum() for side in (self.ours, self.theirs)))
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,6 @@ class Part:
     objects: int  # number of these objects
     confirmed: float  # share of the boxes in view that the witness explains; NaN without any
     boxes: int  # number of these boxes
-
-    @property
-    def row(self) -> tuple[Cell, ...]:
-        """Of a table with PART_COLUMNS."""
-        return self.found, self.objects, self.confirmed, self.boxes
 
 
 PART_COLUMNS = ("found", "of objects", "confirmed", "of boxes")
@@ -121,10 +116,10 @@ class Agreement:
         yield Table("agreement", ("", *names, "frames", "looked at"), rows, dict.fromkeys(names, 2))
         for title in ("groups", "cameras", "distances"):
             of_sides: list[Mapping[str, Part]] = [getattr(side, title) for side in sides]
-            rows = [(name, *(cell for one in of_sides for cell in one.get(name, NO_PART).row)) for name in of_sides[0]]
+            rows = [(name, *(sum((astuple(one.get(name, NO_PART)) for one in of_sides), ()))) for name in of_sides[0]]
             yield Table(title, (title, *PART_COLUMNS * len(sides)), rows, dict.fromkeys(PART_COLUMNS, 2))
         columns = ("shift of what is seen", "right px", "down px", "scale", "pairs")
-        rows = [(name, one.right_px, one.down_px, one.scale, one.pairs) for name, one in self.shifts.items()]
+        rows = [(name, *astuple(one)) for name, one in self.shifts.items()]
         yield Table("shifts", columns, rows, {"right px": 1, "down px": 1, "scale": 2})
         if self.worst:
             rows = [(f"frame {stamp.index}", count) for stamp, count in self.worst]
@@ -138,7 +133,7 @@ class Agreement:
 
 
 def compared(
-    frames: Iterable[tuple[Frame, Boxes3D, Mapping[str, Boxes2D] | None]],
+    frames: Iterable[tuple[Frame, Boxes3D, Seen | None]],
     classes: Mapping[str, ObjectClass],
     range_m: float,
     *,
@@ -146,14 +141,16 @@ def compared(
 ) -> Iterator[FrameAgreement]:
     """Each frame's boxes held against what the witness sees, and against the boxes half a second later.
 
-    frames: with the boxes of each in the world frame, and what the witness sees, None where it did not look. classes:
-    of the boxes. range_m: nothing beyond this distance is counted. has_poses: whether the drive has ego-motion.
+    frames: with the boxes of each in the world frame, and what the witness sees, by camera; None or no camera where it
+    did not look. classes: of the boxes. range_m: nothing beyond this distance is counted. has_poses: whether the drive
+    has ego-motion.
     """
     waiting = deque[tuple[FrameAgreement, Boxes3D]]()
     for frame, boxes, seen in frames:
         shown = boxes.scored(SHOWN_SCORE)
-        sides = (NOTHING, NOTHING) if seen is None else sightings(frame, shown, seen, classes)
-        ours, theirs = (replace(side, counted=side.counted & (side.distances < range_m)) for side in sides)
+        sides = sightings(frame, shown, seen or {}, classes)
+        for side in sides:
+            side["counted"] &= side["distance"] < range_m
         while waiting:
             last, near = waiting[0]
             seconds = (frame.stamp.timestamp_ns - last.stamp.timestamp_ns) / 1e9
@@ -164,7 +161,7 @@ def compared(
             yield replace(last, kept=kept(near, shown, seconds)) if follows else last
             waiting.popleft()
         near = shown[np.linalg.norm(shown.centers - frame.world_from_ego.matrix[:3, 3], axis=1) < range_m - MARGIN_M]
-        waiting.append((FrameAgreement(frame.stamp, ours, theirs, is_looked_at=seen is not None), near))
+        waiting.append((FrameAgreement(frame.stamp, *sides, is_looked_at=bool(seen)), near))
     yield from (last for last, _ in waiting)
 
 
@@ -188,7 +185,7 @@ def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
     """The agreement of all frames. worst: length of the list of frames that differ most."""
     looked = [frame for frame in frames if frame.is_looked_at]
     ours, theirs = (
-        Sightings.concatenate([NOTHING, *(side[side.counted] for side in sides)])
+        np.concatenate([NOTHING, *(side[side["counted"]] for side in sides)])
         for sides in ([frame.ours for frame in looked], [frame.theirs for frame in looked])
     )
     seconds = np.array([_sums(frame) for frame in frames]).reshape(-1, 6)
@@ -204,18 +201,18 @@ def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
             draws = np.random.default_rng(0).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
             low, high = (float(end) for end in np.percentile(_score(draws @ sums), ENDS))
     order = sorted(looked, key=lambda frame: -frame.differences)[:worst]
-    cameras = dict.fromkeys([*theirs.cameras.tolist(), *ours.cameras.tolist()])
-    pairs = Sightings.concatenate([NOTHING, *(frame.ours[frame.ours.overlaps >= PARTNER] for frame in looked)])
+    cameras = dict.fromkeys([*theirs["camera"], *ours["camera"]])
+    pairs = np.concatenate([NOTHING, *(frame.ours[frame.ours["overlap"] >= PARTNER] for frame in looked)])
     rings = {
-        f"{a:g}-{b:g} m": _part(*(side[(a <= side.distances) & (side.distances < b)] for side in (theirs, ours)))
+        f"{a:g}-{b:g} m": _part(*(side[(a <= side["distance"]) & (side["distance"] < b)] for side in (theirs, ours)))
         for a, b in pairwise(RINGS_M)
     }
     return Agreement(
         *(score, low, high, float(total[4] / total[5]) if total[5] else np.nan),
-        {name: _part(*(side[side.groups == index] for side in (theirs, ours))) for index, name in enumerate(GROUPS)},
-        {name: _part(*(side[side.cameras == name] for side in (theirs, ours))) for name in cameras},
+        {name: _part(*(side[side["group"] == index] for side in (theirs, ours))) for index, name in enumerate(GROUPS)},
+        {name: _part(*(side[side["camera"] == name] for side in (theirs, ours))) for name in cameras},
         {name: part for name, part in rings.items() if part.objects or part.boxes},
-        {name: _shift(pairs[pairs.cameras == name]) for name in cameras},
+        {name: _shift(pairs[pairs["camera"] == name]) for name in cameras},
         (len(frames), len(looked)),
         tuple((frame.stamp, frame.differences) for frame in order if frame.differences),
         notes=tuple(_notes(len(theirs))),
@@ -231,7 +228,7 @@ def _notes(objects: int) -> Iterator[str]:
 
 def _sums(frame: FrameAgreement) -> tuple[float, ...]:
     """Of the objects and of the boxes the fits and their number, then `kept`."""
-    sides = (side.fits[side.counted] for side in (frame.theirs, frame.ours))
+    sides = (side["fit"][side["counted"]] for side in (frame.theirs, frame.ours))
     return (*(value for each in sides for value in (float(each.sum()), len(each))), *frame.kept)
 
 
@@ -243,13 +240,13 @@ def _score(sums: Array) -> Array:
 
 
 def _part(theirs: Sightings, ours: Sightings) -> Part:
-    found, confirmed = (float((side.overlaps >= PARTNER).mean()) if len(side) else np.nan for side in (theirs, ours))
+    found, confirmed = (float((side["overlap"] >= PARTNER).mean()) if len(side) else np.nan for side in (theirs, ours))
     return Part(found, len(theirs), confirmed, len(ours))
 
 
 def _shift(pairs: Sightings) -> Shift:
     if not len(pairs):
         return Shift(np.nan, np.nan, np.nan, 0)
-    right, down = np.median((pairs.partners - pairs.corners).reshape(-1, 2, 2).mean(axis=1), axis=0)
-    own, seen = ((side[:, 3] - side[:, 1]) for side in (pairs.corners, pairs.partners))
+    right, down = np.median((pairs["partner"] - pairs["corners"]).reshape(-1, 2, 2).mean(axis=1), axis=0)
+    own, seen = ((side[:, 3] - side[:, 1]) for side in (pairs["corners"], pairs["partner"]))
     return Shift(float(right), float(down), float(np.median(seen / own)), len(pairs))

@@ -22,7 +22,7 @@ from bevcli.geometry.transforms import Array, inverse
 from bevcli.workshop.correspondence.images import matched, neighbours
 from bevcli.workshop.correspondence.residuals import EpipolarResiduals, GroupGeometry, Indices, solve
 from bevcli.workshop.formats.pose_readings import Poses
-from bevcli.workshop.odometry.step_views import FrameView
+from bevcli.workshop.odometry.step_views import FrameView, exponential
 
 LEAST_M = 0.3  # a shorter step tells nothing
 FEWEST = 60  # points of a camera
@@ -128,14 +128,8 @@ class Corrections:
 
     def geometry(self, local: Array) -> GroupGeometry:
         """The geometry of all groups, `Parameters`."""
-        a, b = _motions(local[:, :6]), _motions(local[:, 6:])
+        a, b = exponential(local[:, :6]), exponential(local[:, 6:])
         return replace(self.stated, ego_b_from_ego_a=inverse(b) @ self.stated.ego_b_from_ego_a @ a)
-
-
-def _motions(x: Array) -> Array:
-    matrices = np.broadcast_to(np.eye(4), (len(x), 4, 4)).copy()
-    matrices[:, :3, :3], matrices[:, :3, 3] = Rotation.from_rotvec(x[:, :3]).as_matrix(), x[:, 3:]
-    return matrices
 
 
 def corrected(
@@ -160,7 +154,7 @@ def corrected(
     unknowns = Corrections(GroupGeometry(a, b, motion, np.zeros(2)), columns, deviations)
     for scale in SCALES_PX if start is None else SCALES_PX[-1:]:
         x = solve(unknowns, [(together, scale)], x).x
-    motions = _motions(np.stack([np.interp(rows.times_ns, frames_ns, column) for column in x.reshape(-1, 6).T], 1))
+    motions = exponential(np.stack([np.interp(rows.times_ns, frames_ns, column) for column in x.reshape(-1, 6).T], 1))
     positions = rows.positions + np.einsum("tij,tj->ti", rows.rotations, motions[:, :3, 3])
     return Poses(rows.times_ns, rows.rotations @ motions[:, :3, :3], positions), x / deviations
 

@@ -1,7 +1,6 @@
 """Boxes held against what the witness sees: projected boxes and seen ones of each image, and which are partners."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,34 +26,22 @@ RIDER = 0.2  # overlap of a person and a cycle from which on the person rides it
 DOUBLE = 0.6  # overlap of two seen boxes of a group, such as a car and a truck, that are one object
 POINTS = np.linspace(0, 1, 5)  # of an edge of a box, which a lens bends
 
-
-@dataclass(frozen=True)
-class Sightings:
-    """N projected boxes of a model, or N boxes that the witness sees."""
-
-    frames: NDArray[np.int64]  # (N,) index of the frame
-    cameras: NDArray[np.str_]  # (N,) names
-    corners: Array  # (N, 4) x0, y0, x1, y1 in the image, pixels
-    groups: NDArray[np.int64]  # (N,) index into GROUPS
-    distances: Array  # (N,) to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon
-    scores: Array  # (N,) 0 to 1
-    # (N,) whether it is held against the other side: whole in the image, large enough, and not hidden
-    counted: NDArray[np.bool_]
-    overlaps: Array  # (N,) intersection over union with the partner; 0 without one
-    fits: Array  # (N,) how well it fits its partner, 0 to 1, see `_fits`; of what is seen, times the partner's score
-    partners: Array  # (N, 4) corners of the partner; NaN without one
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> "Sightings":
-        return Sightings(*(getattr(self, field.name)[chosen] for field in fields(self)))
-
-    @staticmethod
-    def concatenate(parts: Sequence["Sightings"]) -> "Sightings":
-        """All of the parts, of which there is at least one."""
-        columns = ([getattr(part, field.name) for part in parts] for field in fields(Sightings))
-        return Sightings(*map(np.concatenate, columns))
+Seen = Mapping[str, Boxes2D]  # camera -> the boxes that the witness sees in its image
+Sightings = NDArray[np.void]  # (N,) of SIGHTING: projected boxes of a model, or boxes that the witness sees
+SIGHTING = np.dtype(
+    [
+        ("camera", np.object_),  # name
+        ("corners", np.float64, 4),  # x0, y0, x1, y1 in the image, pixels
+        ("group", np.int64),  # index into GROUPS
+        # to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon
+        ("distance", np.float64),
+        ("counted", np.bool_),  # held against the other side: whole in the image, large enough, and not hidden
+        ("overlap", np.float64),  # intersection over union with the partner; 0 without one
+        ("fit", np.float64),  # to the partner, 0 to 1, see `_fits`; of what is seen, times the partner's score
+        ("partner", np.float64, 4),  # corners of a projected box's partner; zeros without one
+    ]
+)
+NOTHING: Sightings = np.zeros(0, SIGHTING)
 
 
 def group_of(name: str, classes: Mapping[str, ObjectClass]) -> int:
@@ -91,7 +78,7 @@ def areas(corners: Array) -> Array:
 
 
 def unexplained(
-    frame: Frame, boxes: Boxes3D, seen: Mapping[str, Boxes2D], classes: Mapping[str, ObjectClass]
+    frame: Frame, boxes: Boxes3D, seen: Seen, classes: Mapping[str, ObjectClass]
 ) -> dict[str, NDArray[np.bool_]]:
     """Camera -> (N,) of the boxes in its image, whether the witness is sure of it, and no projected box explains it.
 
@@ -108,7 +95,7 @@ def unexplained(
 
 
 def sightings(
-    frame: Frame, boxes: Boxes3D, seen: Mapping[str, Boxes2D], classes: Mapping[str, ObjectClass]
+    frame: Frame, boxes: Boxes3D, seen: Seen, classes: Mapping[str, ObjectClass]
 ) -> tuple[Sightings, Sightings]:
     """What is projected, and what is seen, in all images of a frame.
 
@@ -119,7 +106,7 @@ def sightings(
     cameras = [camera for camera in frame.rig.cameras if camera.name in seen]
     pairs = [_of_camera(frame, camera, boxes, groups, seen[camera.name]) for camera in cameras]
     ours, theirs = zip((NOTHING, NOTHING), *pairs, strict=True)
-    return Sightings.concatenate(ours), Sightings.concatenate(theirs)
+    return np.concatenate(ours), np.concatenate(theirs)
 
 
 def _of_camera(
@@ -150,24 +137,19 @@ def _of_camera(
     rows, columns = linear_sum_assignment(fits, maximize=True)
     is_pair = table[rows, columns] > 0
     rows, columns = rows[is_pair], columns[is_pair]
-    overlap, fit = table[rows, columns], fits[rows, columns]
-
-    def pairs(own: NDArray[np.int64], count: int, *values: Array) -> Iterator[Array]:
-        for value, missing in zip(values, (0, 0, np.nan), strict=True):
-            column = np.full((count, *value.shape[1:]), missing, dtype=float)
-            column[own] = value
-            yield column
-
-    ours, theirs = (
-        (np.full(count, frame.stamp.index), np.full(count, camera.name)) for count in (len(inside), len(corners))
-    )
-    ground = _ground_distances(camera, corners)
-    of_ours = pairs(rows, len(inside), overlap, fit, corners[columns])
-    of_theirs = pairs(columns, len(corners), overlap, fit * scores[rows], inside[rows])
-    return (
-        Sightings(*ours, inside, groups, distances, scores, is_counted, *of_ours),
-        Sightings(*theirs, corners, kinds, ground, certainties, is_sure, *of_theirs),
-    )
+    ours, theirs = np.zeros(len(inside), SIGHTING), np.zeros(len(corners), SIGHTING)
+    of_ours = inside, groups, distances, is_counted
+    ground = np.linalg.norm(_feet(camera, camera.ego_from_camera, corners, np.zeros(1)), axis=1)
+    of_theirs = corners, kinds, ground, is_sure
+    for side, values in ((ours, of_ours), (theirs, of_theirs)):
+        side["camera"] = camera.name
+        for name, column in zip(("corners", "group", "distance", "counted"), values, strict=True):
+            side[name] = column
+    fit = fits[rows, columns]
+    ours["overlap"][rows] = theirs["overlap"][columns] = table[rows, columns]
+    ours["fit"][rows], theirs["fit"][columns] = fit, fit * scores[rows]
+    ours["partner"][rows] = corners[columns]
+    return ours, theirs
 
 
 def _fits(
@@ -178,37 +160,25 @@ def _fits(
     Mean of the overlap (N, M) and of the share of APART_M within which their feet stand from each other, on the plane
     below the box. boxes: N, world frame. sides: (N, 4) and (M, 4).
     """
-    origin, floor = world_from_camera[:3, 3], boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2
-    own, seen = (_rays_of_feet(camera, corners) @ world_from_camera[:3, :3].T for corners in sides)
-
-    def places(rays: Array) -> Array:
-        """(N, K, 2) where rays (N, K, 3) meet the plane below each box; inf where they do not."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            steps = (floor[:, None] - origin[2]) / rays[..., 2]
-        return np.asarray(rays[..., :2] * np.where(steps > 0, steps, np.inf)[..., None])
-
+    floor = boxes.centers[:, 2] - boxes.sizes_lwh[:, 2] / 2
+    own, seen = (_feet(camera, world_from_camera, corners, floor[:, None]) for corners in sides)
     with np.errstate(invalid="ignore"):
-        off_m = np.linalg.norm(places(own[:, None]) - places(np.broadcast_to(seen, (len(own), *seen.shape))), axis=2)
+        off_m = np.linalg.norm(own.diagonal().T[:, None] - seen, axis=2)
     return np.asarray((overlap + (off_m[..., None] < APART_M).mean(axis=-1)) / 2 * (overlap > 0))
+
+
+def _feet(camera: Camera, frame_from_camera: Array, corners: Array, floor: Array) -> Array:
+    """(..., N, 2) where the middles of the lower edges of rectangles (N, 4) stand on a plane; inf where they do not.
+
+    floor: (..., 1) height of the plane in the frame.
+    """
+    pixels = np.stack([corners[:, [0, 2]].mean(axis=1), corners[:, 3]], axis=1)
+    rays, origin = camera.rays(pixels) @ frame_from_camera[:3, :3].T, frame_from_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = (floor - origin[2]) / rays[:, 2]
+        places = origin[:2] + rays[:, :2] * np.where(steps > 0, steps, np.inf)[..., None]
+    return np.nan_to_num(places, nan=np.inf, posinf=np.inf, neginf=-np.inf)
 
 
 def _heights(corners: Array) -> Array:
     return np.asarray(corners[:, 3] - corners[:, 1])
-
-
-def _rays_of_feet(camera: Camera, corners: Array) -> Array:
-    """(N, 3) directions in the camera frame to the middle of the lower edges of rectangles (N, 4)."""
-    return camera.rays(np.stack([corners[:, [0, 2]].mean(axis=1), corners[:, 3]], axis=1))
-
-
-def _ground_distances(camera: Camera, corners: Array) -> Array:
-    """(N,) distance of what stands on flat ground at the lower edge of a rectangle; inf above the horizon."""
-    rays = _rays_of_feet(camera, corners) @ camera.ego_from_camera[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        steps = np.where(rays[:, 2] < 0, -camera.ego_from_camera[2, 3] / rays[:, 2], np.inf)
-    places = camera.ego_from_camera[:2, 3] + rays[:, :2] * steps[:, None]
-    return np.nan_to_num(np.linalg.norm(places, axis=1), nan=np.inf, posinf=np.inf)
-
-
-_NO, _NONE, _INDICES = np.zeros(0), np.zeros((0, 4)), np.zeros(0, int)
-NOTHING = Sightings(_INDICES, _NO.astype(str), _NONE, _INDICES, _NO, _NO, _NO.astype(bool), _NO, _NO, _NONE)

@@ -3,75 +3,54 @@
 Its weights are those of the detector in the model `photographs`. That model's own boxes in images are these.
 """
 
-import csv
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from bevcli.checkpoints import bundled_weights, read_safetensors
-from bevcli.config import load_config
-from bevcli.errors import InputError
 from bevcli.frame import Frame
 from bevcli.geometry.boxes import Boxes2D
+from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor, camera_boxes
-from bevcli.model.nanodet import NanoDet, NanoDetConfig
-from bevcli.parsing.documents import CSV_BYTES
-from bevcli.parsing.files import read_text
+from bevcli.model.step import model_inputs
+from bevcli.parsing.documents import CsvRow, csv_rows
 from bevcli.sequences.files.boxes_table import IMAGE_COLUMNS
+from bevcli.workshop.trust.sightings import Seen
 
-SOURCE, PART = "photographs", "image_detector."  # the model of the package whose weights have the detector's, and where
 
-
-@dataclass(frozen=True)
 class Witness:
-    """A detector, and how it gets its images."""
+    """The detector of the model `photographs`, on the CPU."""
 
-    detector: NanoDet
-    preprocessor: Preprocessor
+    def __init__(self) -> None:
+        model = load_model("photographs", device="cpu")
+        self._network: Any = model.network
+        self._preprocessor = Preprocessor(model.config, threads=1)
 
-    def seen(self, frame: Frame) -> Mapping[str, Boxes2D]:
+    def seen(self, frame: Frame) -> Seen:
         """Camera -> the boxes in its image, of the cameras that have one."""
-        prepared = self.preprocessor(frame)
+        prepared, config = self._preprocessor(frame), self._preprocessor.config
         if not prepared.has_image.any():
             return {}
+        inputs = model_inputs(prepared, None, config)
         with torch.inference_mode():
-            maps = self.detector(prepared.images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-            found = self.detector.image_boxes(maps, prepared.has_image)
-        return camera_boxes(found, prepared, self.preprocessor.config.image)
+            found = self._network.find_image_boxes(inputs.images, inputs.has_image, inputs.image_sizes)
+        return camera_boxes(found, prepared, config.image)
+
+
+load_witness = cache(Witness)
 
 
 def seen_in_run(path: Path) -> dict[tuple[int, int], dict[str, Boxes2D]]:
-    """The image_boxes.csv of a run: index and time of a frame -> cell of a camera -> boxes. Raises InputError."""
-    rows: dict[tuple[int, int], dict[str, list[list[str]]]] = {}
-    try:
-        table = csv.reader(read_text(path, CSV_BYTES).splitlines())
-        if next(table, None) != list(IMAGE_COLUMNS):
-            raise ValueError(f"expected the columns {', '.join(IMAGE_COLUMNS)}")
-        for index, _, time, camera, *cells in table:
-            rows.setdefault((int(index), int(time)), {}).setdefault(camera, []).append(cells)
-        return {stamp: {name: _boxes(of) for name, of in cameras.items()} for stamp, cameras in rows.items()}
-    except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as boxes in images ({error}): run again with --force") from None
+    """The image_boxes.csv of a run: index and time of a frame -> camera -> boxes. Raises InputError."""
+    rows: dict[tuple[int, int], dict[str, list[CsvRow]]] = {}
+    for row in csv_rows(path, IMAGE_COLUMNS, may_be_empty=True):
+        of_frame = rows.setdefault((row.integer("frame"), row.integer("timestamp_ns")), {})
+        of_frame.setdefault(row.cells["camera"], []).append(row)
+    return {stamp: {name: _boxes(of) for name, of in cameras.items()} for stamp, cameras in rows.items()}
 
 
-def _boxes(rows: list[list[str]]) -> Boxes2D:
-    """Boxes of rows of class, score and edges."""
-    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(len(rows), 5)
-    if not np.isfinite(numbers).all():
-        raise ValueError("a number is not finite")
-    return Boxes2D(numbers[:, 1:], np.array([row[0] for row in rows]), numbers[:, 0])
-
-
-@cache
-def load_witness() -> Witness:
-    """The witness of the package, on the CPU."""
-    path = bundled_weights(SOURCE)
-    assert path is not None
-    tensors, _ = read_safetensors(path)
-    detector = NanoDet(NanoDetConfig())
-    detector.load_state_dict({key.removeprefix(PART): x for key, x in tensors.items() if key.startswith(PART)})
-    return Witness(detector.eval().to(memory_format=torch.channels_last), Preprocessor(load_config(SOURCE), threads=1))  # type: ignore[call-overload]
+def _boxes(rows: list[CsvRow]) -> Boxes2D:
+    scores, *corners = (np.array([row.number(name) for row in rows]) for name in ("score", "x0", "y0", "x1", "y1"))
+    return Boxes2D(np.stack(corners, -1), np.array([row.cells["class"] for row in rows]), scores)
