@@ -20,7 +20,6 @@ from bevcli.workshop.trust.camera_faults import Mistake, Points, Side, camera_fi
 from bevcli.workshop.trust.faults import (
     find_faults,
     image_findings,
-    input_faults,
     model_faults,
     one_cause,
     repeated,
@@ -176,8 +175,8 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> planted_faults.Drive:
 @pytest.mark.parametrize("fault", planted_faults.FAULTS)
 def test_a_planted_fault_is_named_on_a_rendered_drive(street: planted_faults.Drive, fault: str):
     plant, code = planted_faults.FAULTS[fault]
-    faulty = plant(street, "CAM_FRONT")
-    assert code in {finding.code for finding in input_faults(faulty)}
+    found = planted_faults.found_in(load_model("demo"), plant(street, "CAM_FRONT"), code)
+    assert code in {finding.code for finding in found}
 
 
 @pytest.mark.slow

@@ -1,16 +1,17 @@
 """`find_faults`: mistakes in the input, and broken weights or engines, that show without labels. One line each.
 
 In this order: cameras that are dead or frozen, by their pixels; single cameras and poses, by how points move in the
-images; an engine, by the boxes of PyTorch; weights, by what the witness sees.
+images; an engine, by the boxes of PyTorch; colours and weights, by what the witness sees.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student_t
 
 from bevcli.errors import Finding, errors_of
 from bevcli.frame import Drive, Frame
@@ -18,23 +19,25 @@ from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.inference import TORCH, run
 from bevcli.inference.load import Model
-from bevcli.sequences.files.boxes_file import FrameBoxes
+from bevcli.recording.log_boxes import true_positives
 from bevcli.sequences.open import select
 from bevcli.workshop.formats.pose_readings import Poses
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.step_views import Viewer
 from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
+from bevcli.workshop.trust.sightings import Seen
 from bevcli.workshop.trust.witness import load_witness
 
 STEPS = 6  # between frames whose images are compared
 POSE_STEPS = 4  # between frames whose motion is measured
-TRIED = 3  # frames in which the model's boxes are compared
+TRIED = 3, 18  # least frames and images in which the model's boxes are compared
 SMALL = (64, 36)  # pixels of the images whose grey levels are compared
 FLAT = 2.0  # grey levels: standard deviation of an image that shows something
 STILL, MOVING = 0.05, 1.0  # change of a frozen image, as a share of the others'; least change of these, grey levels
-SURE, REPEATED_M = 0.3, 2.0  # boxes that are looked for: score, error
+SURE = 0.3  # score of boxes that are looked for
 LEAST_SAME = 0.5  # share of such boxes that a sound engine gives
+CLEAREST, CERTAIN = 3, 0.99  # objects of an image that tell its colours; Student's quantile that their gain exceeds
 LEAST_FOUND = 0.3  # share of what the witness sees that sound weights find: 0.4 or more in 39 runs
 
 
@@ -114,30 +117,25 @@ def image_findings(names: Iterable[str], frames: Sequence[dict[str, Array]]) -> 
 
 
 def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
-    """Faults that show in the boxes of a few frames: a broken engine or broken weights."""
-    first = max(0, (len(drive.stamps) - TRIED) // 2)
-    some = select(drive, range(first, min(first + TRIED, len(drive.stamps))))
-    boxes = frame_boxes(model, some)
-    frames = [some.load(place) for place in range(len(some.stamps))]
+    """Faults that show in a few frames: a broken engine, exchanged colours, broken weights."""
+    count = min(max(TRIED[0], -(-TRIED[1] // len(drive.rig.cameras))), len(drive.stamps))
+    first = (len(drive.stamps) - count) // 2
+    some = select(drive, range(first, first + count))
+    steps = list(run(model, some, temporal=False, track=False))
+    frames = [frame for frame, _ in steps]
     seen = [load_witness().seen(frame) for frame in frames]
-    return engine_findings(model, some, boxes) or weights_findings(model, frames, boxes, seen)
+    held = zip(frames, (one.boxes_world for _, one in steps), seen, strict=True)
+    broken = engine_findings(model, some, [one.boxes for _, one in steps])
+    return broken or (*color_findings(frames, seen), *weights_findings(model, held))
 
 
-def frame_boxes(model: Model, drive: Drive, *, temporal: bool = False) -> list[FrameBoxes]:
-    """The boxes of each frame, in the ego frame; by default of each frame alone, without history."""
-    return [
-        FrameBoxes(frame.stamp, frame.world_from_ego, prediction.boxes_ego)
-        for frame, prediction in run(model, drive, temporal=temporal, track=False)
-    ]
-
-
-def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> tuple[Finding, ...]:
-    """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine."""
+def engine_findings(model: Model, drive: Drive, boxes: Sequence[Boxes3D]) -> tuple[Finding, ...]:
+    """The finding about an engine whose boxes are not those of PyTorch. boxes: those of the engine, by frame."""
     if not model.needs_export:  # PyTorch; or a file alone, whose network is not known
         return ()
-    plain = frame_boxes(replace(model, engine=TORCH, precision="fp32"), drive)
-    sides = [[each.boxes for each in side] for side in (plain, boxes)]
-    both = [side for side in (repeated(*sides), repeated(*reversed(sides))) if side[0]]
+    in_torch = replace(model, engine=TORCH, precision="fp32")
+    plain = [one.boxes for _, one in run(in_torch, drive, temporal=False, track=False)]
+    both = [side for side in (repeated(plain, boxes), repeated(boxes, plain)) if side[0]]
     count, same = min(both, key=lambda side: side[1], default=(0, 1.0))
     if same >= LEAST_SAME:
         return ()
@@ -147,14 +145,35 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[FrameBoxes]) -> 
     return (Finding("engine-broken", "error", None, message, found, expected, advice),)
 
 
-def weights_findings(
-    model: Model, frames: Sequence[Frame], boxes: Sequence[FrameBoxes], seen: Sequence[Mapping[str, Boxes2D]]
-) -> tuple[Finding, ...]:
-    """The finding about weights that find little of what the witness sees."""
-    rows = zip(frames, boxes, seen, strict=True)
-    in_world = [(one, of.boxes.transformed(one.world_from_ego.matrix), sees) for one, of, sees in rows]
+def color_findings(frames: Sequence[Frame], seen: Sequence[Seen]) -> tuple[Finding, ...]:
+    """The finding about images whose red and blue are exchanged: the witness is surer in the other order.
+
+    seen: of the witness, by frame.
+    """
+    gains = list[float]()
+    for frame, as_stated in zip(frames, seen, strict=True):
+        images = {name: replace(one, pixels_bgr=one.pixels_bgr[..., ::-1]) for name, one in frame.images.items()}
+        exchanged = load_witness().seen(replace(frame, images=images))
+        gains += [_clearest(exchanged[name]) - _clearest(boxes) for name, boxes in as_stated.items()]
+    if len(gains) < 2:
+        return ()
+    gain, deviation = float(np.mean(gains)), float(np.std(gains, ddof=1)) / len(gains) ** 0.5
+    if gain <= student_t.ppf(CERTAIN, len(gains) - 1) * deviation:
+        return ()
+    found = f"the {CLEAREST} best scores of an image gain {gain:.2f} ± {deviation:.2f} with red and blue exchanged"
+    message, advice = "red and blue are exchanged in the images", "state the order of the channels, or exchange them"
+    return (Finding("color-order", "error", None, message, found, "", advice),)
+
+
+def _clearest(boxes: Boxes2D) -> float:
+    """Sum of the best scores of vehicles, people and cycles in an image."""
+    return float(boxes.scores[boxes.classes != "traffic light"][:CLEAREST].sum())
+
+
+def weights_findings(model: Model, frames: Iterable[tuple[Frame, Boxes3D, Seen]]) -> tuple[Finding, ...]:
+    """The finding about weights that find little of what the witness sees. frames: as for `compared`."""
     range_m = model.config.bev_grid.nearest_side_m
-    parts = agreement(list(compared(in_world, model.config.object_classes, range_m, has_poses=False))).groups.values()
+    parts = agreement(list(compared(frames, model.config.object_classes, range_m, has_poses=False))).groups.values()
     objects = sum(part.objects for part in parts)
     share = sum(part.found * part.objects for part in parts if part.objects) / max(objects, 1)
     if objects < FEWEST_OBJECTS or share >= LEAST_FOUND:
@@ -170,11 +189,6 @@ def repeated(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, 
 
     A box is repeated by one of its class that is at most 2 m away and has a score of 0.15 or more.
     """
-    count = same = 0
-    for frame, others in zip(wanted, given, strict=True):
-        boxes, candidates = frame.scored(SURE), others.scored(SURE / 2)
-        for center, name in zip(boxes.centers, boxes.classes, strict=True):
-            places = candidates.centers[candidates.classes == name]
-            same += bool(np.linalg.norm(places[:, :2] - center[:2], axis=1).min(initial=np.inf) < REPEATED_M)
-        count += len(boxes)
-    return count, same / max(count, 1)
+    sides = zip(given, wanted, strict=True)
+    found = np.concatenate([true_positives(others.scored(SURE / 2), boxes.scored(SURE))[1] for others, boxes in sides])
+    return len(found), float(found.sum() / max(len(found), 1))
