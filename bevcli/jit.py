@@ -1,25 +1,42 @@
-"""`njit` of numba for all compiled functions: where nothing may be written, they are compiled without a cache.
+"""`njit` of numba for all compiled functions: no state of the disk keeps one from being compiled.
 
 numba keeps compiled functions beside the source file, or in the user's cache folder. Where neither can be written, as
-for a read-only installation without a home, numba itself raises an error at import.
+for a read-only installation without a home, numba itself raises an error at import; later on a full disk, and where a
+file of the cache is damaged.
 """
 
 import logging
 import os
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache
 
 from bevcli.errors import BevcliError
 
 
+class _Cache(FunctionCache):  # type: ignore[misc]  # numba has no types
+    """A cache whose files may be damaged: they count as missing, and are written anew. What cannot be written is not."""
+
+    @contextmanager
+    def _guard_against_spurious_io_errors(self) -> Iterator[None]:  # of all reading and writing
+        try:
+            yield
+        except OSError:  # a full disk
+            pass
+        except Exception:  # pickle raises any for other contents
+            with suppress(OSError):
+                self.flush()
+
+
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """`numba.njit(cache=True, **options)`, with a temporary cache or none where numba finds no place for it.
+    """`numba.njit(**options)` with a cache, a temporary one or none where numba finds no place for it.
 
     Raises BevcliError if numba's compiler is switched off.
     """
@@ -29,13 +46,16 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     options["no_cfunc_wrapper"] = True  # nobody calls compiled functions from C
 
     def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
         for is_cached in (lambda: True, _temporary_cache):
             try:
-                return numba.njit(cache=is_cached(), **options)(function)
+                if is_cached():
+                    dispatcher._cache = _Cache(function)
+                break
             except RuntimeError as error:
                 if "cannot cache function" not in str(error):
                     raise
-        return numba.njit(**options)(function)
+        return dispatcher
 
     return compiled
 

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import resource
 import shutil
 import stat
 import subprocess
@@ -58,14 +59,43 @@ def test_a_temporary_folder_that_others_can_write_is_not_used(read_only, tmp_pat
     assert not any(shared.iterdir())
 
 
-def test_a_function_is_compiled_once_its_cache_is_written(tmp_path, monkeypatch):
+def imported_double(tmp_path, monkeypatch):
     (tmp_path / "doubling.py").write_text(
         "from bevcli.jit import njit\n\n@njit()\ndef double(number):\n    return 2 * number\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    double = importlib.import_module("doubling").double
+    monkeypatch.delitem(sys.modules, "doubling", raising=False)
+    return importlib.import_module("doubling").double
+
+
+def test_a_function_is_compiled_once_its_cache_is_written(tmp_path, monkeypatch):
+    double = imported_double(tmp_path, monkeypatch)
     assert not is_compiled(double)
     assert double(3) == 6
     assert is_compiled(double)
     os.utime(tmp_path / "doubling.py", (2e9, 2e9))  # a later version of the file
     assert not is_compiled(double)
+
+
+@pytest.mark.parametrize("contents", [b"", b"\x80\x04garbage", b"cut"])
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_a_damaged_cache_is_written_anew(tmp_path, monkeypatch, suffix, contents):
+    assert imported_double(tmp_path, monkeypatch)(3) == 6
+    [file] = (tmp_path / "__pycache__").glob(f"*{suffix}")
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-9] if contents == b"cut" else contents)
+    double = imported_double(tmp_path, monkeypatch)
+    assert double(3) == 6
+    assert file.stat().st_size == len(whole)
+    assert is_compiled(double)
+
+
+def test_a_full_disk_costs_the_cache_only(tmp_path, monkeypatch):
+    double = imported_double(tmp_path, monkeypatch)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        assert double(3) == 6
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list((tmp_path / "__pycache__").glob("*.nb?*"))

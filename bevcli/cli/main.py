@@ -100,6 +100,13 @@ class _Group(TyperGroup):
             self.commands[cmd_name].name = cmd_name
         return self.commands.get(cmd_name)
 
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:  # typer would print "Aborted!" and nothing else
+            advice = "if it is none of the input, delete the folders __pycache__ of the installation"
+            raise BevcliError(f"a file that is read ends too early ({reason_of(error)}): {advice}") from error
+
     def get_help(self, ctx: Any) -> str:
         return printable(super().get_help(ctx))
 

@@ -74,6 +74,14 @@ def test_a_package_that_cannot_be_imported_is_one_line(tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_module_that_is_cut_off_is_one_line(tmp_path):
+    """As a full disk leaves it, by Python 3.11: click alone prints "Aborted!"."""
+    (tmp_path / "onnx.py").write_text("import marshal; marshal.loads(b'')")
+    done = subprocess.run([*PROGRAM, "quantize", "x.onnx"], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert done.stderr.startswith("error: a file that is read ends too early (EOF read where object expected): ")
+
+
 def test_other_errors_are_bugs_and_have_tracebacks(tmp_path, monkeypatch):
     def fail():
         raise KeyError("x")

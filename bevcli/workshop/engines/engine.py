@@ -375,14 +375,14 @@ class CachedFile:
                 if time.time() - path.stat().st_mtime > UNUSED_S:
                     path.unlink()
                     path.with_suffix(".json").unlink(missing_ok=True)
-        with whole_file(self.path, parents=True) as unfinished:
+        with whole_file(self.path, parents=True, regular=True) as unfinished:
             yield unfinished
 
     def opened(self, engine: type[Engine], calibrated_with: str = "") -> tuple[ExportedModel, str]:
         """The file in an engine, after it was written; its facts are kept beside it."""
         network = engine.open(self.path)
         file_facts = FileFacts(bytes(network.digest.tolist()).hex(), calibrated_with)
-        write_whole(self.facts_path, msgspec.json.encode(file_facts))
+        write_whole(self.facts_path, msgspec.json.encode(file_facts), regular=True)
         return network, calibrated_with
 
 

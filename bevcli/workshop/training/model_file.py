@@ -251,7 +251,7 @@ def write_model_file(
 def _cost_of(table: Mapping[str, Any], device: torch.device, data: DriveOptions, longest_s: float) -> "Cost":
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / "model.toml"
-        trial.write_text(as_toml(table), encoding="utf-8")
+        write_whole(trial, as_toml(table).encode())
         job = prepare_training(str(trial), device, data, TrainOptions(out=Path(folder) / "out"))
         return measure_cost(job, longest_s)
 
