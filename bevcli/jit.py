@@ -22,7 +22,7 @@ from bevcli.errors import BevcliError
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]  # numba has no types
-    """A cache whose files may be damaged: they count as missing, and are written anew. What cannot be written is not."""
+    """A cache whose damaged files count as missing and are written anew; on a full disk, none are written."""
 
     @contextmanager
     def _guard_against_spurious_io_errors(self) -> Iterator[None]:  # of all reading and writing

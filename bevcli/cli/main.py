@@ -4,6 +4,7 @@ Exit codes: 0 success, 1 a mistake in the input, 2 a mistake in usage (click's o
 143 by SIGTERM; a command may have one of its own. No command module imports torch, OpenCV or rerun before it is called.
 """
 
+import errno
 import inspect
 import os
 import re
@@ -174,7 +175,9 @@ def program() -> Iterator[None]:
     except OSError as error:  # the system refuses: no space, no permission, a name that is too long
         prefix = "" if error.filename is None else f"{error.filename}: "
         message = None if error.strerror else system_error(error)
-        say(f"error: {message or one_line(prefix + str(error.strerror or error))}", err=True)
+        full = prefix == "" and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        advice = " (of an output, or of the folder for temporary files, which TMPDIR names)" if full else ""
+        say(f"error: {message or one_line(prefix + str(error.strerror or error) + advice)}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         sys.exit(1)
     except Exception as error:

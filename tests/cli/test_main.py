@@ -188,7 +188,8 @@ def test_a_full_output_device_is_one_line(arguments, monkeypatch, capsys):
         program(),
     ):
         app()
-    assert capsys.readouterr().err == "error: No space left on device\n"
+    where = "of an output, or of the folder for temporary files, which TMPDIR names"
+    assert capsys.readouterr().err == f"error: No space left on device ({where})\n"
 
 
 @pytest.mark.parametrize(

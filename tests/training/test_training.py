@@ -1,6 +1,7 @@
 """The training as a whole: it converges, is reproducible, resumes after a kill and rejects invalid input."""
 
 import os
+import resource
 import shutil
 import signal
 from collections.abc import Callable
@@ -205,11 +206,15 @@ def test_validation_is_drawn_up_to_its_best_score(tmp_path: Path, monkeypatch: p
     assert 0.02 < high < 0.03
 
 
-def test_a_kill_while_writing_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_or_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = BEVFormer(CONFIG)
     optimizer = make_optimizer(model, model.backbone, OptimizerConfig())
     save_checkpoint(tmp_path / "checkpoint.pt", 7, model, optimizer)
-    before = (tmp_path / "checkpoint.pt").read_bytes()
+    before, limits = (tmp_path / "checkpoint.pt").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    with pytest.raises(OutputError, match=r"/checkpoint\.pt: cannot be written \(is the disk full\?"):
+        save_checkpoint(tmp_path / "checkpoint.pt", 8, model, optimizer)
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
     def die(contents: object, path: Path) -> None:
         path.write_bytes(b"half")

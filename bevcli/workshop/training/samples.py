@@ -48,6 +48,7 @@ from bevcli.workshop.training.augmentation import (
     mask_images,
 )
 from bevcli.workshop.training.targets import Targets, frame_targets, joined_targets
+from bevcli.writing import output_errors
 
 _CHOICE = 8  # drives among which the other clips of a batch are drawn, at least
 
@@ -361,8 +362,17 @@ def _make_file(clip: tuple[int, int, int]) -> Path:
     made, name = maker.clip(*clip), "-".join(map(str, clip))
     needed = FREE_CLIPS * sum(tensor.nbytes for _, tensor in tensors_in(made))
     path = next((folder for folder in folders if shutil.disk_usage(folder).free >= needed), folders[-1]) / name
-    torch.save(made, path)
+    with output_errors(path):
+        save(made, path)
     return path
+
+
+def save(contents: object, path: Path) -> None:
+    """`torch.save`; raises OSError where the disk is full."""
+    try:
+        torch.save(contents, path)
+    except RuntimeError as error:
+        raise OSError(f"is the disk full? {error}") from error
 
 
 def _read_file(path: Path) -> Batch:

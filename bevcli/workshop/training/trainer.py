@@ -58,7 +58,7 @@ from bevcli.workshop.training.job import (
     trainings_here,
 )
 from bevcli.workshop.training.kernels import choose_training_kernels
-from bevcli.workshop.training.samples import Batch, BatchMaker, loaded_batches
+from bevcli.workshop.training.samples import Batch, BatchMaker, loaded_batches, save
 from bevcli.workshop.training.validation import (
     LearningCurve,
     Validation,
@@ -434,7 +434,7 @@ def save_checkpoint(
     if average is not None:
         contents["average"] = dict(average)
     with whole_file(path) as unfinished:
-        torch.save(contents, unfinished)
+        save(contents, unfinished)
 
 
 def load_checkpoint(
