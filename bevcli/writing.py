@@ -61,7 +61,8 @@ def whole_file(path: Path, *, parents: bool = False, regular: bool = False) -> I
 
     parents: make the folders that are missing. regular: the file takes the place of a pipe too: a pipe that somebody
     has put there would be waited for.
-    Raises OutputError where the file cannot be written; every OSError of the block counts as this.
+    Raises OutputError where the file cannot be written; every OSError of the block counts as this. Errors of the block
+    name `path`.
     """
     machine = f"{UNFINISHED}{zlib.crc32(platform.node().encode()):08x}-"
     unfinished = path.with_name(f"{machine}{os.getpid()}-{uuid.uuid4().hex[:8]}{path.suffix}")
@@ -79,9 +80,12 @@ def whole_file(path: Path, *, parents: bool = False, regular: bool = False) -> I
             yield unfinished
             unfinished.chmod(mode)  # some libraries, such as safetensors, write files that only their owner can read
             os.replace(unfinished, path)
+    except OutputError as error:
+        raise OutputError(str(error).replace(str(unfinished), str(path))) from error
     finally:
-        with suppress(OSError):
-            unfinished.unlink()
+        for left in (unfinished, partial_path(unfinished)):
+            with suppress(OSError):
+                left.unlink()
 
 
 def write_whole(path: Path, content: bytes, **how: bool) -> None:

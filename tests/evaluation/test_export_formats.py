@@ -3,6 +3,8 @@
 import csv
 import resource
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,9 +18,10 @@ from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.workshop.formats.kitti import kitti_labels, write_kitti
+from bevcli.workshop.formats.nuscenes_output import write_submission
 
 # Camera axes in the ego frame, as columns: x right, y down, z forward.
 LOOKING_AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -170,14 +173,21 @@ def test_kitti_takes_the_calibration_next_to_the_boxes(tmp_path: Path) -> None:
     assert all((tmp_path / "kitti" / name).read_text() == (tmp_path / "stated" / name).read_text() for name in names)
 
 
-def test_a_table_that_does_not_fit_leaves_the_old_one(tmp_path: Path) -> None:
+def submitted(frame: FrameBoxes) -> FrameBoxes:
+    boxes = replace(frame.boxes, scores=np.ones(len(frame.boxes)))
+    return replace(frame, boxes=boxes, extras={"sample_token": str(frame.stamp.index)})
+
+
+@pytest.mark.parametrize("write", [write_csv, write_boxes, write_submission])
+def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path: Path, write: Callable[..., int]) -> None:
     boxes = read_boxes(Path(__file__).parents[2] / "samples/street/ground_truth.json")
-    path, before = tmp_path / "boxes.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
+    boxes = replace(boxes, frames=tuple(map(submitted, boxes.frames)))
+    path, before = tmp_path / "boxes.txt", resource.getrlimit(resource.RLIMIT_FSIZE)
     path.write_text("old")
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
-        with pytest.raises(OutputError, match=r"boxes\.csv: cannot be written"):
-            write_csv(boxes, path)
+        with pytest.raises(OutputError, match=r"/boxes\.txt: cannot be written"):
+            write(boxes, path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.read_text() == "old"

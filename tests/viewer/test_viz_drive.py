@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import bevcli
 from bevcli.cli import viewing
 from bevcli.errors import InputError
 from bevcli.recording import entities
+from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.viewer.recording_reader import RecordingReader
 from bevcli.workshop.formats.nuscenes_output import write_submission
@@ -151,3 +153,12 @@ def test_the_viewer_shows_both_models_and_a_tab_for_each(folder, tmp_path):
     image = cv2.imread(str(tmp_path / "two.png"))[:, : round(0.7 * 1920)].astype(int)
     for own in entities.LAYER_COLORS:
         assert (np.abs(image - own[::-1]).sum(-1) < 40).sum() > 200
+
+
+def test_a_recording_that_is_not_finished_leaves_the_old_one(folder, monkeypatch):
+    (folder / "old.rrd").write_text("old")
+    monkeypatch.setattr(Recording, "log", lambda *_: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        bevcli.record(bevcli.open_sequence(folder / "samples/street"), None, folder / "old.rrd")
+    assert (folder / "old.rrd").read_text() == "old"
+    assert not list(folder.glob("*unfinished*"))

@@ -24,6 +24,7 @@ from bevcli.parsing.documents import TOML_BYTES, parse_toml, typed, without_garb
 from bevcli.parsing.files import read_text
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
+from bevcli.writing import whole_file
 
 FUTURE_DECIMALS = 3  # millimetres
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
@@ -376,7 +377,8 @@ class BoxesWriter(IncrementalJson):
 
 def write_boxes(boxes: BoxesFile, path: Path) -> int:
     """Write all frames of a file; return the number of boxes. Raises OutputError."""
-    with BoxesWriter(path, boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev) as writer:
+    facts = boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev
+    with whole_file(path) as unfinished, BoxesWriter(unfinished, *facts) as writer:
         for frame in boxes.frames:
             writer.write(frame)
     return sum(len(frame.boxes) for frame in boxes.frames)

@@ -24,9 +24,9 @@ class CsvWriter(GrowingFile):
     Metres and radians; a cell is empty where a value is unknown. Raises OutputError where the file cannot be written.
     """
 
-    def __init__(self, path: Path, resume_at: int | None = None, *, name: Path | None = None) -> None:
-        """resume_at: `size` of an earlier writer of this file, to go on from there. name: for errors."""
-        super().__init__(path, resume_at, name)
+    def __init__(self, path: Path, resume_at: int | None = None) -> None:
+        """resume_at: `size` of an earlier writer of this file, to go on from there."""
+        super().__init__(path, resume_at)
         if resume_at is None:
             self.append((",".join(COLUMNS) + "\n").encode())
 
@@ -71,5 +71,5 @@ class ImageBoxesWriter(GrowingFile):
 
 def write_csv(boxes: BoxesFile, path: Path) -> int:
     """Write all boxes in their frame of reference; return their number. Raises OutputError."""
-    with whole_file(path) as unfinished, CsvWriter(unfinished, name=path) as writer:
+    with whole_file(path) as unfinished, CsvWriter(unfinished) as writer:
         return sum(writer.write(frame, boxes.frame_of_reference) for frame in boxes.frames)

@@ -28,7 +28,7 @@ from bevcli.workshop.formats.nuscenes import NuScenesDrive
 from bevcli.workshop.formats.nuscenes_index import CLASS_OF_CATEGORY, NUSCENES
 from bevcli.workshop.formats.nuscenes_tables import Row
 from bevcli.workshop.formats.output import FolderWriter, same_rig
-from bevcli.writing import write_whole
+from bevcli.writing import whole_file, write_whole
 
 VERSION = "v1.0-custom"
 PARTS = (VERSION, "samples", "maps", "can_bus")  # what the writer creates and `force` removes
@@ -329,7 +329,7 @@ def write_submission(boxes: BoxesFile, path: Path, *, tracking: bool = False) ->
         raise InputError(
             'a nuScenes tracking submission needs boxes with "instance" and "track_score": use `bevcli run --track`'
         )
-    with SubmissionWriter(path, tracking=tracking) as writer:
+    with whole_file(path) as unfinished, SubmissionWriter(unfinished, tracking=tracking) as writer:
         for frame in boxes.frames:
             writer.write(frame)
     return len(boxes.frames)

@@ -17,6 +17,7 @@ from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
 from bevcli.sequences.open import count_labels, open_sequence
 from bevcli.workshop.scores.detection import ranges_m
 from bevcli.workshop.scores.inputs import RELIABLE, ScoredInput, boxes_of_drive, open_predictions
+from bevcli.writing import whole_file
 
 MOST = 2  # models: each has a colour
 FAR_M = 150.0  # boxes that are all farther away are of another drive, or in another frame of reference
@@ -82,7 +83,7 @@ def record_steps(
         yield from notes
     options = RecordingOptions(level="minimal") if score is None else RecordingOptions(level="minimal", score=score)
     labelled = 0
-    with Recording(path, drive, _recorded(drive, inputs), options) as recording:
+    with whole_file(Path(path)) as file, Recording(file, drive, _recorded(drive, inputs), options) as recording:
         for index in range(len(drive.stamps)):
             frame = drive.load(index)
             recording.log(frame, [by_frame[index] for by_frame in of_frames])
