@@ -21,7 +21,7 @@ from numba.core.caching import FunctionCache
 from bevcli.errors import BevcliError
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]  # numba has no types
+class _Cache(FunctionCache):
     """A cache whose damaged files count as missing and are written anew; on a full disk, none are written."""
 
     @contextmanager

@@ -88,6 +88,8 @@ def open_writer(path: Path, drive: Drive, options: WriteOptions) -> DriveWriter:
         raise InputError(f"`form={options.form}` (`--format`): unknown format (expected {', '.join(NAMES)})")
     if options.boxes is not None and options.form != "mcap":
         raise InputError(f"`boxes` (`--boxes`): {NAMES[options.form]} takes no boxes of a run: remove the option")
+    if path.suffix == ".mcap" and options.form != "mcap":
+        raise InputError(f'{path}: would be a folder: pass `form="mcap"` (`--format mcap`), or another name')
     if options.form == "native":
         return NativeWriter(path, with_ego_motion=drive.has_ego_motion, force=options.force, facts=drive.facts)
     if options.form == "nuscenes":
