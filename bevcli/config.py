@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -151,7 +151,7 @@ def read_model_file(name: str) -> tuple[dict[str, Any], str]:
 
 def _dataclass(table: dict[str, Any], cls: type[T], file: str, prefix: str) -> T:
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    hints = typing.get_type_hints(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
     for key in table.keys() - fields.keys():
         hint = did_you_mean(key, fields, f"expected one of {', '.join(fields)}", '"')
         raise ConfigError(f'{file}: unknown key "{prefix}{key}"; {hint}')
@@ -204,5 +204,14 @@ def _describe(hint: Any) -> str:
         if arguments[-1] is Ellipsis:
             return f"a list, each element {_describe(arguments[0])}"
         return f"a list of {len(arguments)}, each element {_describe(arguments[0])}"
+    if origin is Annotated:
+        kind, limits = _describe(arguments[0]), arguments[1]
+        if limits.gt is not None:
+            return f"{kind} above {limits.gt:g}"
+        if limits.lt is not None:
+            return f"{kind} from {limits.ge:g} to below {limits.lt:g}"
+        return (
+            f"{kind} of {limits.ge:g} or more" if limits.le is None else f"{kind} from {limits.ge:g} to {limits.le:g}"
+        )
     names = {bool: "true or false", int: "an integer", float: "a number", str: "a string"}
     return names.get(hint, "a table")

@@ -114,9 +114,10 @@ def _check_ranges(made: Any) -> None:
     """Raise InputError for a number outside the range of its option."""
     for field in dataclasses.fields(made):
         value, option = getattr(made, field.name), field.metadata.get("option")
-        if option is not None and isinstance(value, int | float):
+        numbers = [n for n in (value if isinstance(value, tuple) else (value,)) if isinstance(n, int | float)]
+        if option is not None and numbers:
             low, high = option.minimum, option.maximum
-            if (low is not None and not value >= low) or (high is not None and not value <= high):
+            if (low is not None and not min(numbers) >= low) or (high is not None and not max(numbers) <= high):
                 limits = f"{low:g} to {high:g}" if None not in (low, high) else f"{low if high is None else high:g}"
                 ending = "" if None not in (low, high) else " or more" if high is None else " or less"
                 raise InputError(f"{_with_value(made, field.name)}: expected {limits}{ending}")

@@ -109,11 +109,17 @@ def test_the_error_for_a_mistake_is_one_line_with_file_and_key(tmp_path: Path, t
         ("levels = 1", "levels = 5", "neck.levels is 5"),
         ("output_stages = [4]", "output_stages = [5]", "[backbone]: output_stages"),
         ("rows = 50", "rows = 0", "at least one row"),
-        ("attention_heads = 8", "attention_heads = 0", "[encoder]: layers, heads"),
-        ("queries = 900", "queries = 0", "[decoder]: layers, heads"),
+        ("attention_heads = 8", "attention_heads = 0", '"encoder.attention_heads" must be an integer of 1 or more'),
+        ("queries = 900", "queries = 0", '"decoder.queries" must be an integer of 1 or more, but is 0'),
         ("x_range_m = [-51.2, 51.2]", "x_range_m = [51.2, -51.2]", "each range goes from a smaller"),
         ("rate_hz = 2.0", "rate_hz = 0", "rate_hz and max_gap_s must be positive"),
-        ("blocks = [3, 4, 6, 3]", "blocks = [3, 0, 6, 3]", "[backbone]: blocks"),
+        (
+            "blocks = [3, 4, 6, 3]",
+            "blocks = [3, 0, 6, 3]",
+            '"backbone.blocks" must be a list of 4, each element an integer of',
+        ),
+        ("queries = 900", "fade_duplicates = 1.1", "a number from 0 to 1, but is 1.1"),
+        ("queries = 900", "merge_duplicates = inf", "a number of 0 or more, but is inf"),
         ('heads = ["detection"]', 'heads = ["detektion"]', '"heads" must be'),
         ("channels = 256", "channels = 96000000000000000", "channels is 96000000000000000 (expected at most 4096)"),
         ("channels = 256", "channels = 960000", "channels is 960000 (expected at most 4096)"),
@@ -145,8 +151,8 @@ def test_a_uniad_file_configures_tracks_and_map(tmp_path: Path) -> None:
     assert isinstance(config, UniADConfig)
     assert config.map_classes == ("drivable_area", "divider", "pedestrian_crossing", "contour")
     for wrong, message in [
-        (("keep_score = 0.35", "keep_score = 0.45"), "[track_queries]: keep_score and birth_score must be 0 to 1"),
-        (("max_misses = 5", "max_misses = 0"), "[track_queries]: max_misses, memory_length"),
+        (("keep_score = 0.35", "keep_score = 0.45"), "[track_queries]: keep_score must not be above birth_score"),
+        (("max_misses = 5", "max_misses = 0"), '"track_queries.max_misses" must be an integer of 1 or more'),
         (('box_z = "bottom"', 'box_z = "top"'), '"track_queries.box_z" must be "center" or "bottom"'),
         (("queries = 901", "queries = 1"), "decoder.queries must be at least 2"),
         (('["detection"]', '["detection", "segmentation"]'), 'heads must be ["detection"]'),

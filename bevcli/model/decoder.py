@@ -18,6 +18,7 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, wrap_angle
 from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.encoder import FeedForward
+from bevcli.parsing.documents import Count, NotNegative, Share, ShareBelowOne
 
 BOX_CODE_SIZE = 10
 FADING_WIDTHS = 0.7  # distance from a better box, in its widths, where fading has fallen to 1/e
@@ -29,33 +30,22 @@ LEAST_EXPONENT = -60.0  # what is less adds nothing, and takes a CPU up to fifty
 class DecoderConfig:
     """The object decoder."""
 
-    layers: int = 6  # number of decoder layers
-    attention_heads: int = 8  # heads of self-attention and of cross-attention
-    points: int = 4  # sampling points of a head of the cross-attention to the BEV map
-    queries: int = 900  # number of object queries
-    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
-    dropout: float = 0.1  # probability, 0 to below 1
-    max_boxes: int = 300  # number of boxes that are decoded, those with the best scores
+    layers: Count = 6  # number of decoder layers
+    attention_heads: Count = 8  # heads of self-attention and of cross-attention
+    points: Count = 4  # sampling points of a head of the cross-attention to the BEV map
+    queries: Count = 900  # number of object queries
+    feed_forward_width: Count = 512  # channels between the two linear layers of the feed-forward network
+    dropout: ShareBelowOne = 0.1  # probability
+    max_boxes: Count = 300  # number of boxes that are decoded, those with the best scores
     # distance, in sizes of a box, within which boxes of its class count as the same object: they share their places;
     # see `merged`. With 0, as published, boxes stay where they are
-    merge_duplicates: float = 0.0
+    merge_duplicates: NotNegative = 0.0
     # share of its score that a box loses at the place of a better box of its class, and less beside it; see `faded`.
     # With 0, as published, scores stay as they are
-    fade_duplicates: float = 0.0
+    fade_duplicates: Share = 0.0
     # number of sets of queries that are trained side by side, each to find every object (Group DETR, Chen et al. 2023).
     # Inference uses the first set only
-    training_groups: int = 1
-
-    def __post_init__(self) -> None:
-        counts = (self.layers, self.attention_heads, self.points, self.queries, self.max_boxes, self.training_groups)
-        if min(*counts, self.feed_forward_width) < 1 or not 0 <= self.dropout < 1:
-            raise ValueError(
-                "layers, heads, points, queries, boxes, groups and width must be positive, dropout from 0 to below 1"
-            )
-        if not 0 <= self.fade_duplicates <= 1:
-            raise ValueError("fade_duplicates must be from 0 to 1")
-        if not 0 <= self.merge_duplicates < math.inf:
-            raise ValueError("merge_duplicates must be 0 or more, and finite")
+    training_groups: Count = 1
 
     @classmethod
     def of_head(cls, head: Any, layers: int, queries: int) -> "DecoderConfig":

@@ -18,23 +18,19 @@ from bevcli.model.deformable_attention import (
 )
 from bevcli.model.ego_motion import EgoMotionConfig
 from bevcli.model.pillar_projection import PillarHits
+from bevcli.parsing.documents import Count, ShareBelowOne
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
     """The encoder."""
 
-    layers: int = 6  # number of encoder layers
-    attention_heads: int = 8  # heads of both attentions
-    temporal_points: int = 4  # sampling points of a head in each of the two BEV maps
-    spatial_points: int = 8  # sampling points of a head in each feature level, a multiple of the grid's pillar points
-    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
-    dropout: float = 0.1  # probability, 0 to below 1
-
-    def __post_init__(self) -> None:
-        counts = (self.layers, self.attention_heads, self.temporal_points, self.spatial_points)
-        if min(*counts, self.feed_forward_width) < 1 or not 0 <= self.dropout < 1:
-            raise ValueError("layers, heads, points and width must be positive, dropout from 0 to below 1")
+    layers: Count = 6  # number of encoder layers
+    attention_heads: Count = 8  # heads of both attentions
+    temporal_points: Count = 4  # sampling points of a head in each of the two BEV maps
+    spatial_points: Count = 8  # sampling points of a head in each feature level, a multiple of the grid's pillar points
+    feed_forward_width: Count = 512  # channels between the two linear layers of the feed-forward network
+    dropout: ShareBelowOne = 0.1  # probability
 
 
 class Encoder(nn.Module):

@@ -18,6 +18,7 @@ from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.road_slopes import RoadSlopes
 from bevcli.model.upload import upload_together
+from bevcli.parsing.documents import Count, CountOrNone
 
 GROUP_COUNT = 4
 # Classes that the detector tells apart well, in groups: 0 those that it does not know, vehicles, people, cycles.
@@ -40,15 +41,11 @@ LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before t
 class HybridQueriesConfig:
     """The [hybrid_queries] table of a model with a detector."""
 
-    count: int = 0  # of queries, the best boxes of all cameras; 0 for none
+    count: CountOrNone = 0  # of queries, the best boxes of all cameras; 0 for none
     # whether the rig of each frame is levelled first, by the slope of the road that the boxes tell, where the detector
     # stands beside the backbone: the vehicle pitches and rolls, and poses rarely state it
     level: bool = False
-    features: int = 128  # channels of the detector's maps
-
-    def __post_init__(self) -> None:
-        if self.count < 0 or self.features < 1:
-            raise ValueError("count must be 0 or more, features 1 or more")
+    features: Count = 128  # channels of the detector's maps
 
 
 class HybridQueries(nn.Module):

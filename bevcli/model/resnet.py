@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from bevcli.model.backbone import Backbone, Stage
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
+from bevcli.parsing.documents import Count
 
 
 @dataclass(frozen=True)
@@ -18,21 +19,19 @@ class ResNetConfig:
     title: ClassVar[str] = "ResNet"
 
     # number of bottlenecks in each of the four stages; (3, 4, 6, 3) is ResNet-50, (3, 4, 23, 3) ResNet-101
-    blocks: tuple[int, int, int, int] = (3, 4, 6, 3)
+    blocks: tuple[Count, Count, Count, Count] = (3, 4, 6, 3)
     # which convolution of a stage's first bottleneck has the stride: "pytorch" the 3x3, "caffe" the first 1x1
     style: Literal["pytorch", "caffe"] = "pytorch"
     output_stages: tuple[int, ...] = (4,)  # the stages (1 to 4) whose maps go to the neck
     # the stages whose 3x3 convolutions are modulated deformable convolutions (DCNv2)
     deformable_stages: tuple[int, ...] = ()
-    width: int = 64  # channels of the stem; stage s has 4 · width · 2^(s - 1) output channels
+    width: Count = 64  # channels of the stem; stage s has 4 · width · 2^(s - 1) output channels
     kind: Literal["resnet"] = "resnet"  # chooses this backbone
 
     def __post_init__(self) -> None:
         stages = self.output_stages + self.deformable_stages
         if not self.output_stages or not set(stages) <= {1, 2, 3, 4}:
             raise ValueError("output_stages and deformable_stages must hold stages 1 to 4, output_stages at least one")
-        if min(*self.blocks, self.width) < 1:
-            raise ValueError("blocks and width must be positive")
 
     def output_channels(self) -> tuple[int, ...]:
         """Channels of the map of each output stage."""

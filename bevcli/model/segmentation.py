@@ -18,6 +18,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import DecoderConfig, DecoderLayer, branch, inverse_sigmoid
 from bevcli.model.deformable_attention import DeformableAttention
 from bevcli.model.encoder import FeedForward
+from bevcli.parsing.documents import Count, Share, ShareBelowOne
 
 # Each stuff class has one query of its own. The thing class has many; training matches them to instances.
 STUFF_CLASSES, THING_CLASS = tuple(MAP_CLASSES)[:-1], tuple(MAP_CLASSES)[-1]
@@ -27,23 +28,16 @@ STUFF_CLASSES, THING_CLASS = tuple(MAP_CLASSES)[:-1], tuple(MAP_CLASSES)[-1]
 class SegmentationConfig:
     """The segmentation head."""
 
-    thing_queries: int = 60  # T, the largest number of vehicles
-    location_layers: int = 2  # layers of the location decoder
-    mask_layers: int = 3  # layers of the mask decoder
-    attention_heads: int = 8  # heads of all attentions
-    points: int = 4  # sampling points of a head in the location decoder
-    feed_forward_width: int = 512  # channels between the two linear layers of a feed-forward network
-    dropout: float = 0.1  # probability, 0 to below 1
-    map_scale: int = 4  # cells of the panoptic map along a side of a BEV cell
-    min_stuff: float = 0.45  # probability above which a cell of the map has a stuff class
-    min_thing: float = 0.2  # probability above which a cell of the map belongs to a vehicle
-
-    def __post_init__(self) -> None:
-        if min(self.mask_layers, self.map_scale) < 1:
-            raise ValueError("mask_layers and map_scale must be positive")
-        if not (0 <= self.min_stuff <= 1 and 0 <= self.min_thing <= 1):
-            raise ValueError("min_stuff and min_thing must be from 0 to 1")
-        DecoderConfig.of_head(self, self.location_layers, self.thing_queries)  # checks the other numbers
+    thing_queries: Count = 60  # T, the largest number of vehicles
+    location_layers: Count = 2  # layers of the location decoder
+    mask_layers: Count = 3  # layers of the mask decoder
+    attention_heads: Count = 8  # heads of all attentions
+    points: Count = 4  # sampling points of a head in the location decoder
+    feed_forward_width: Count = 512  # channels between the two linear layers of a feed-forward network
+    dropout: ShareBelowOne = 0.1  # probability
+    map_scale: Count = 4  # cells of the panoptic map along a side of a BEV cell
+    min_stuff: Share = 0.45  # probability above which a cell of the map has a stuff class
+    min_thing: Share = 0.2  # probability above which a cell of the map belongs to a vehicle
 
 
 @dataclass(frozen=True)

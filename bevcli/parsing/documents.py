@@ -44,6 +44,14 @@ Number = Annotated[float, msgspec.Meta(gt=-LARGEST_NUMBER, lt=LARGEST_NUMBER)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=400)]
 _Form = TypeVar("_Form")
 
+# Numbers of a configuration with their range, which `bevcli.config` holds a file to.
+Count = Annotated[int, msgspec.Meta(ge=1)]
+CountOrNone = Annotated[int, msgspec.Meta(ge=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+ShareBelowOne = Annotated[float, msgspec.Meta(ge=0, lt=1)]
+
 
 def read_json(
     path: Path,

@@ -37,6 +37,7 @@ from bevcli.model.resnet import BasicBlock
 from bevcli.model.step import Clip, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.temporal_model import OfficialNames
 from bevcli.model.upload import on_device, upload
+from bevcli.parsing.documents import Count
 from bevcli.workshop.engines.export_form import ExportedStep, ExportForm, Port, camera_feed, camera_ports
 
 NO_EGO_MOTION = EgoMotionConfig(can_bus=False, shift=False, rotation=False)
@@ -49,12 +50,8 @@ ClipMemory = list[FeatureMaps]  # the image features of all frames of training c
 class BevFusionConfig:
     """The fusion of the window's BEV maps."""
 
-    blocks: int = 3  # number of residual blocks
-    width: int = 512  # channels of the blocks; the first one has a convolution as shortcut where it gets others
-
-    def __post_init__(self) -> None:
-        if min(self.blocks, self.width) < 1:
-            raise ValueError("blocks and width must be positive")
+    blocks: Count = 3  # number of residual blocks
+    width: Count = 512  # channels of the blocks; the first one has a convolution as shortcut where it gets others
 
 
 @dataclass(frozen=True, kw_only=True)

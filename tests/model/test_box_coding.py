@@ -101,12 +101,6 @@ def test_several_better_boxes_fade_a_box_once() -> None:
     )
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.1])
-def test_a_share_outside_0_to_1_is_refused(share: float) -> None:
-    with pytest.raises(ValueError, match="fade_duplicates must be from 0 to 1"):
-        replace(CONFIG.decoder, fade_duplicates=share)
-
-
 def merged_boxes(centers: list[tuple[float, float]], logits: list[list[float]]) -> Boxes3D:
     """The decoded boxes with scores above 0.01, of queries with boxes 2 m wide and long, duplicates merged."""
     count = len(centers)
@@ -143,9 +137,3 @@ def test_scores_of_merged_boxes_stay_below_1() -> None:
 def test_boxes_of_tiny_scores_keep_their_numbers_finite() -> None:
     boxes = outputs(np.full((3, 3), -300.0), encode(some_boxes(3))).boxes(MERGING)
     assert np.isfinite(boxes.centers).all()
-
-
-@pytest.mark.parametrize("reach", [-0.1, float("inf"), float("nan")])
-def test_a_reach_below_0_or_without_end_is_refused(reach: float) -> None:
-    with pytest.raises(ValueError, match="merge_duplicates must be 0 or more, and finite"):
-        replace(CONFIG.decoder, merge_duplicates=reach)

@@ -118,8 +118,6 @@ def test_things_are_moved_by_whole_cells(offset: tuple[float, float], column: in
         {"stuff": ("road", "road")},
         {"things": tuple("abcdefgh")},
         {"max_things": 1000},
-        {"attention_levels": 0},
-        {"encoder_layers": 0},
     ],
 )
 def test_a_wrong_configuration_is_an_error(wrong: dict) -> None:

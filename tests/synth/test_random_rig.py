@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from same_world import with_rig
 
-from bevcli.errors import InputError
+from bevcli.config import TRAINING, settings_of_table
+from bevcli.errors import ConfigError, InputError
 from bevcli.frame import Frame
 from bevcli.geometry.cameras import CameraRig, Distortion
 from bevcli.geometry.transforms import apply, inverse, rigid
@@ -15,6 +16,7 @@ from bevcli.sequences.open import open_sequence
 from bevcli.workshop.synth.catalog import Assets
 from bevcli.workshop.synth.drive import RenderedDrive, RenderedFrame, export_drive
 from bevcli.workshop.synth.rig import DrawnRig, RigDistribution, draw_rig, nuscenes_like_rig, rig_for_rendering
+from bevcli.workshop.training.job import TrainingConfig
 
 SIZE = (512, 288)
 RANDOM = RigDistribution(random_share=1.0)
@@ -62,15 +64,16 @@ def test_the_share_of_random_rigs_is_as_asked_for():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"random_share": 1.5}, "random_share is a probability"),
-        ({"fov_deg": (90.0, 60.0)}, "fov_deg goes from a smaller to a larger"),
-        ({"cameras": (0, 3)}, "cameras must be from 1 to 16"),
-        ({"delay_s": 1.0}, "delay_s must be from 0 to 0.1"),
+        ({"random_share": 1.5}, '"training.rigs.random_share" must be a number from 0 to 1, but is 1.5'),
+        ({"fov_deg": [90.0, 60.0]}, "fov_deg goes from a smaller to a larger"),
+        ({"cameras": [0, 3]}, 'cameras" must be a list of 2, each element an integer from 1 to 16'),
+        ({"delay_s": 1.0}, 'delay_s" must be a number from 0 to 0.1'),
+        ({"aspects": []}, "aspects must not be empty"),
     ],
 )
 def test_a_wrong_distribution_is_rejected(wrong, message):
-    with pytest.raises(ValueError, match=message):
-        RigDistribution(**wrong)
+    with pytest.raises(ConfigError, match=message):
+        settings_of_table({TRAINING: {"rigs": wrong}}, TRAINING, TrainingConfig, "own.toml")
 
 
 @pytest.fixture(scope="module")

@@ -36,8 +36,6 @@ def test_probability_zero_leaves_images_unchanged() -> None:
         assert variation(NONE, random)(frame) is frame
     assert randomised(images, RandomisationConfig(), LITE, torch.Generator()) is images
     assert AugmentationConfig().randomisation == RandomisationConfig()
-    with pytest.raises(ValueError, match="color is a probability"):
-        RandomisationConfig(color=1.5)
 
 
 def test_distortion_changes_the_image_and_is_reproducible() -> None:

@@ -217,5 +217,5 @@ def test_boxes_outside_the_grid_are_detected_too() -> None:
 
 def test_a_negative_weight_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text("[training.perspective_loss]\ndepth_weight = -1.0\n")
-    with pytest.raises(ConfigError, match=r"perspective_loss\]: layers and the weights must not be negative"):
+    with pytest.raises(ConfigError, match=r'perspective_loss.depth_weight" must be a number of 0 or more, but is -1.0'):
         load_table(tmp_path / "wrong.toml", TRAINING, TrainingConfig)

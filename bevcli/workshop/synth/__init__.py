@@ -9,12 +9,11 @@ Each module imports only from those before it.
 """
 
 import re
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bevcli.errors import InputError
-from bevcli.options import named, option, options
+from bevcli.options import option, options
 from bevcli.sequences.options import ClassOptions
 
 if TYPE_CHECKING:
@@ -88,17 +87,6 @@ class RenderOptions:
         maximum=4,
     )
     force: bool = option(default=False, help="Replace a sequence in OUT.")
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            stated, value = field.metadata.get("option"), getattr(self, field.name)
-            if stated is None or stated.minimum is None or value is None:
-                continue
-            low, high = stated.minimum, stated.maximum
-            for number in value if isinstance(value, tuple) else (value,):
-                if number < low or (high is not None and number > high):
-                    wanted = f"{low} or more" if high is None else f"{low} to {high}"
-                    raise InputError(f"{named(type(self), field.name)}: expected {wanted}, found {number}")
 
 
 @options()

@@ -7,9 +7,11 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
@@ -17,6 +19,7 @@ from scipy.interpolate import RectBivariateSpline
 from bevcli.errors import InputError
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, Distortion, default_ego_from_bev, fisheye_table
 from bevcli.geometry.transforms import Array, rigid, rotation_about_z
+from bevcli.parsing.documents import Share
 from bevcli.sequences.files.calibration_file import read_calibration
 from bevcli.workshop.synth import Body
 
@@ -167,16 +170,10 @@ MATERIAL_FILES = ("models/*-*.npz", "skies/*.png", "textures/*-*.png")
 _STREAM = 0x7269_6773  # keeps the draws apart from those of the street with the same seed
 _CENTER_X_M = 1.4  # middle of the vehicle, ahead of the rear axle
 Range = tuple[float, float]
-_LIMITS: dict[str, Range] = {
-    **dict.fromkeys(("random_share", "front_share", "distorted_share", "delayed_share", "supersampled_share"), (0, 1)),
-    **dict.fromkeys(("coarse_share", "moving_share", "unstated_share", "varied_share"), (0, 1)),
-    "cameras": (1, 16),
-    "fov_deg": (10, 140),
-    "jpeg_quality": (1, 100),
-    "coarsest": (0.1, 1),
-    "aspects": (0.3, 4),
-    "delay_s": (0, 0.1),
-}  # lowest and highest value of fields of `RigDistribution`
+CameraCount = Annotated[int, Meta(ge=1, le=16)]
+FieldOfView = Annotated[float, Meta(ge=10, le=140)]
+Quality = Annotated[int, Meta(ge=1, le=100)]
+Aspect = Annotated[float, Meta(ge=0.3, le=4)]
 
 
 @dataclass(frozen=True)
@@ -186,30 +183,32 @@ class RigDistribution:
     A share is a probability from 0 to 1. A range is the lowest and the highest value, drawn uniformly.
     """
 
-    random_share: float = 0.0  # share of the drives with a random rig; the others have the default rig
-    cameras: tuple[int, int] = (4, 8)  # number of cameras
-    fov_deg: Range = (45.0, 110.0)  # horizontal; rigs that look all around get enough to leave no gap, if possible
+    random_share: Share = 0.0  # share of the drives with a random rig; the others have the default rig
+    cameras: tuple[CameraCount, CameraCount] = (4, 8)  # number of cameras
+    # horizontal; rigs that look all around get enough to leave no gap, if possible
+    fov_deg: tuple[FieldOfView, FieldOfView] = (45.0, 110.0)
     fov_spread: float = 0.2  # cameras of a rig differ in it by a factor of at most 1 + this, up or down
-    aspects: tuple[float, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)  # width / height of the images
+    # width / height of the images
+    aspects: tuple[Aspect, ...] = (1.778, 1.6, 1.5, 1.333, 1.25, 1.9)
     focal_ratio: float = 0.02  # largest relative difference of the focal lengths along x and y
     principal_point: float = 0.06  # largest distance from the image centre, relative to width and height
     height_m: Range = (0.8, 2.8)  # of the cameras above the ground; those of a rig differ by at most 0.15 m
     radius_m: Range = (0.2, 1.8)  # distance from the middle of the roof, along x; half of it along y
-    front_share: float = 0.2  # share of the rigs that look ahead and to the sides only
+    front_share: Share = 0.2  # share of the rigs that look ahead and to the sides only
     yaw_jitter_deg: float = 12.0  # largest deviation of a camera from even spacing
     tilt_deg: float = 3.0  # largest pitch and roll of a camera
     bev_tilt_deg: float = 2.0  # largest pitch and roll of the bev frame
     bev_height_m: Range = (0.0, 2.5)  # height of the bev frame's origin above the ground
-    distorted_share: float = 0.2  # share of the rigs with lens distortion
-    delayed_share: float = 0.4  # share of the rigs whose cameras take their images at different times
-    delay_s: float = 0.05  # largest time of an image after that of its frame
-    supersampled_share: float = 0.5  # share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel
-    coarse_share: float = 0.15  # share of the rigs with images of a lower resolution than the model's,
-    coarsest: float = 0.6  # by a factor from this to 1
-    jpeg_quality: tuple[int, int] = (60, 95)
-    moving_share: float = 0.0  # share of the drives whose body pitches and rolls
-    unstated_share: float = 0.5  # share of those with level poses, which do not state it
-    varied_share: float = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
+    distorted_share: Share = 0.2  # share of the rigs with lens distortion
+    delayed_share: Share = 0.4  # share of the rigs whose cameras take their images at different times
+    delay_s: Annotated[float, Meta(ge=0, le=0.1)] = 0.05  # largest time of an image after that of its frame
+    supersampled_share: Share = 0.5  # share of the rigs whose images are anti-aliased, by 2 x 2 samples a pixel
+    coarse_share: Share = 0.15  # share of the rigs with images of a lower resolution than the model's,
+    coarsest: Annotated[float, Meta(ge=0.1, le=1)] = 0.6  # by a factor from this to 1
+    jpeg_quality: tuple[Quality, Quality] = (60, 95)
+    moving_share: Share = 0.0  # share of the drives whose body pitches and rolls
+    unstated_share: Share = 0.5  # share of those with level poses, which do not state it
+    varied_share: Share = 0.0  # share of the drives with varied shapes, colours, patterns, light, nameless objects
     material: str = ""  # folder of models and photographs for these drives (`MaterialFolder`); "" for none
 
     def __post_init__(self) -> None:
@@ -217,12 +216,8 @@ class RigDistribution:
             low, high = getattr(self, name)
             if low > high:
                 raise ValueError(f"{name} goes from a smaller to a larger number")
-        for name, (low, high) in _LIMITS.items():
-            value = getattr(self, name)
-            values = value if isinstance(value, tuple) else (value,)
-            if not values or not low <= min(values) <= max(values) <= high:
-                kind = "is a probability," if name.endswith("_share") else "must be"
-                raise ValueError(f"{name} {kind} from {low} to {high}")
+        if not self.aspects:
+            raise ValueError("aspects must not be empty")
         if self.material and not self.varied_share:
             raise ValueError("material is for drives with varied looks: varied_share must be above 0")
 

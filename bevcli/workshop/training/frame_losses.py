@@ -33,6 +33,7 @@ from bevcli.model.network import Network, build_network
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.model.upload import upload
+from bevcli.parsing.documents import CountOrNone, NotNegative
 from bevcli.workshop.training import losses
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.samples import Batch
@@ -275,17 +276,13 @@ def _branch(channels: int, outputs: int, layers: int) -> nn.Sequential:
 class PerspectiveLossConfig:
     """The [training.perspective_loss] table."""
 
-    weight: float = 0.0  # of the whole loss; 0 disables it
-    layers: int = 2  # hidden convolutions of each of the head's two branches
-    class_weight: float = 2.0  # of the classes within the loss
-    offset_weight: float = 0.25  # of the offsets to the projected centre within the loss
-    depth_weight: float = 1.0  # of the log depths within the loss
-    size_weight: float = 0.25  # of the log sizes within the loss
-    rotation_weight: float = 0.25  # of the rotations within the loss
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 0:
-            raise ValueError("layers and the weights must not be negative")
+    weight: NotNegative = 0.0  # of the whole loss; 0 disables it
+    layers: CountOrNone = 2  # hidden convolutions of each of the head's two branches
+    class_weight: NotNegative = 2.0  # of the classes within the loss
+    offset_weight: NotNegative = 0.25  # of the offsets to the projected centre within the loss
+    depth_weight: NotNegative = 1.0  # of the log depths within the loss
+    size_weight: NotNegative = 0.25  # of the log sizes within the loss
+    rotation_weight: NotNegative = 0.25  # of the rotations within the loss
 
 
 def perspective_loss(
@@ -331,16 +328,15 @@ def perspective_loss(
 class DistillationLossConfig:
     """The [training.distillation_loss] table."""
 
-    weight: float = 0.0  # of the mean squared difference of the BEV maps; 0 disables this part
-    feature_weight: float = 0.0  # of that of the neck's maps, by the teacher's variance; it then sees augmented images
+    weight: NotNegative = 0.0  # of the mean squared difference of the BEV maps; 0 disables this part
+    # of that of the neck's maps, by the teacher's variance; it then sees augmented images
+    feature_weight: NotNegative = 0.0
     teacher: str = ""  # weights of the teacher, a file or a model's name
     model: str = ""  # name or TOML file of the teacher's model; "" for the model that is trained
 
     def __post_init__(self) -> None:
-        if min(self.weight, self.feature_weight) < 0 or (self.active and not self.teacher):
-            raise ValueError(
-                "weight and feature_weight must not be negative, and teacher must name weights where one is positive"
-            )
+        if self.active and not self.teacher:
+            raise ValueError("teacher must name weights where weight or feature_weight is positive")
 
     @property
     def active(self) -> bool:

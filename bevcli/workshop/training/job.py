@@ -19,7 +19,7 @@ from bevcli.config import TRAINING, load_config, load_table, settings_of_table
 from bevcli.errors import ConfigError, InputError, OutputError
 from bevcli.inference.load import weights_file
 from bevcli.model.network import Network, build_network
-from bevcli.parsing.documents import read_json
+from bevcli.parsing.documents import Count, CountOrNone, Positive, ShareBelowOne, read_json
 from bevcli.runs.state import OWN, folder_lock
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import Drives, Split, training_drives, write_split
@@ -89,20 +89,15 @@ def join_process_group(device: torch.device) -> ProcessGroup:
 class OptimizerConfig:
     """The [training.optimizer] table."""
 
-    learning_rate: float = 2e-4  # the peak learning rate
+    learning_rate: Positive = 2e-4  # the peak learning rate
     backbone_share: float = 0.1  # learning rate of the image backbone relative to the rest; 1 for an untrained backbone
     weight_decay: float = 0.01  # of AdamW
-    warm_up_steps: int = 500  # steps in which the rate rises linearly
+    warm_up_steps: CountOrNone = 500  # steps in which the rate rises linearly
     warm_up_start: float = 1 / 3  # relative rate at step 0
     final_share: float = 1e-3  # relative rate at the end of the cosine decay
-    max_gradient_norm: float = 35.0  # gradients are clipped to this L2 norm
-    average: float = 0.0  # decay an update of a running average of the weights, which is scored and released; 0: none
-
-    def __post_init__(self) -> None:
-        if min(self.learning_rate, self.max_gradient_norm) <= 0 or self.warm_up_steps < 0:
-            raise ValueError("learning_rate and max_gradient_norm must be positive, warm_up_steps not negative")
-        if not 0 <= self.average < 1:
-            raise ValueError("average must be from 0 to below 1")
+    max_gradient_norm: Positive = 35.0  # gradients are clipped to this L2 norm
+    # decay an update of a running average of the weights, which is scored and released; 0: none
+    average: ShareBelowOne = 0.0
 
     def learning_rate_at(self, step: int, steps: int) -> float:
         """The learning rate of a step (0 to steps - 1)."""
@@ -120,27 +115,21 @@ CHECKPOINT = "checkpoint.pt"  # in the output folder
 class TrainingConfig(LossConfigs):
     """The [training] table of a model file."""
 
-    steps: int = 10_000  # number of steps. A step draws one batch of clips, or `clips.in_turn` batches
-    held_out: int = 2  # the last drives, so many, are for evaluation only; 0 evaluates on the training drives
-    evaluate_every: int = 1000  # steps between evaluations
-    checkpoint_every: int = 250  # steps between checkpoints
+    steps: Count = 10_000  # number of steps. A step draws one batch of clips, or `clips.in_turn` batches
+    held_out: CountOrNone = 2  # the last drives, so many, are for evaluation only; 0 evaluates on the training drives
+    evaluate_every: Count = 1000  # steps between evaluations
+    checkpoint_every: Count = 250  # steps between checkpoints
     freeze_batch_norm: bool = False  # keep the running statistics of batch norms, for fine-tuning
-    frozen_stages: int = 0  # of the backbone, from the stem on, with their batch norms; 0 trains all of it
-    loaders: int = 0  # processes that make batches ahead, 1 for a thread; 0 is 1 on a CPU, with a GPU all cores but two
-    kept_share: float = 0.25  # share of the free memory for decoded images, of all loaders together; 0 keeps none
+    frozen_stages: CountOrNone = 0  # of the backbone, from the stem on, with their batch norms; 0 trains all of it
+    # processes that make batches ahead, 1 for a thread; 0 is 1 on a CPU, with a GPU all cores but two
+    loaders: CountOrNone = 0
+    # share of the free memory for decoded images, of all loaders together; 0 keeps none
+    kept_share: ShareBelowOne = 0.25
     weights_dtype: Literal["float32", "float16"] = "float32"  # data type of weights.safetensors
     clips: ClipConfig = field(default_factory=ClipConfig)  # how clips are drawn
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)  # image augmentation
     rigs: RigDistribution = field(default_factory=RigDistribution)  # the rigs of rendered drives
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)  # AdamW and the learning rate schedule
-
-    def __post_init__(self) -> None:
-        if min(self.steps, self.evaluate_every, self.checkpoint_every) < 1:
-            raise ValueError("steps, evaluate_every and checkpoint_every must be positive")
-        if min(self.held_out, self.loaders, self.frozen_stages) < 0:
-            raise ValueError("held_out, loaders and frozen_stages must not be negative")
-        if not 0 <= self.kept_share < 1:
-            raise ValueError("kept_share must be from 0 to below 1")
 
 
 CORES_OF_TRAINING = 2  # that make no batches, with a GPU

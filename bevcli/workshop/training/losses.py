@@ -17,6 +17,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
+from bevcli.parsing.documents import NotNegative, Positive
 from bevcli.workshop.training.targets import AnyMasks, AnyTargets, PaddedTargets, padded, padded_masks
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
@@ -73,15 +74,13 @@ MIN_MOVING_MPS = 0.5  # slower objects count as stationary
 class DetectionLossConfig:
     """Weights of the detection loss. The class and box weights apply to the matching costs too."""
 
-    class_weight: float = 2.0  # of the focal loss of the classes
-    box_weight: float = 0.25  # of the L1 loss of the box codes
-    velocity_weight: float = 0.2  # of vx and vy within the L1 loss
-    moving_weight: float = 1.0  # additional factor for moving objects: else zero everywhere may be the smallest loss
-    quality_m: float = 0.0  # above 0, class targets are exp(-d / quality_m), d metres between the centres, instead of 1
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 0:
-            raise ValueError("the weights and quality_m must not be negative")
+    class_weight: NotNegative = 2.0  # of the focal loss of the classes
+    box_weight: NotNegative = 0.25  # of the L1 loss of the box codes
+    velocity_weight: NotNegative = 0.2  # of vx and vy within the L1 loss
+    # additional factor for moving objects: else zero everywhere may be the smallest loss
+    moving_weight: NotNegative = 1.0
+    # above 0, class targets are exp(-d / quality_m), d metres between the centres, instead of 1
+    quality_m: NotNegative = 0.0
 
 
 def detection_loss(
@@ -154,12 +153,8 @@ def box_losses(predicted: Tensor, truth: Tensor, assigned: Tensor, config: Detec
 class DenseLossConfig:
     """The [training.dense_loss] table."""
 
-    weight: float = 0.0  # of the whole loss; 0 disables it, as published
-    reach_m: float = 1.5  # cells up to this distance from an object's centre are positives, metres
-
-    def __post_init__(self) -> None:
-        if self.weight < 0 or self.reach_m <= 0:
-            raise ValueError("weight must not be negative, reach_m must be positive")
+    weight: NotNegative = 0.0  # of the whole loss; 0 disables it, as published
+    reach_m: Positive = 1.5  # cells up to this distance from an object's centre are positives, metres
 
 
 class DenseHead(nn.Module):
@@ -208,14 +203,10 @@ DICE_SMOOTHING = 1e-3
 class SegmentationLossConfig:
     """The [training.segmentation_loss] table."""
 
-    class_weight: float = 1.0  # of the focal loss of the classes
-    location_weight: float = 2.0  # of the L1 loss of the things' locations
-    dice_weight: float = 1.0  # of the dice loss of the masks
-    pixel_weight: float = 10.0  # of the focal loss of the masks, averaged over the cells of a mask
-
-    def __post_init__(self) -> None:
-        if min(vars(self).values()) < 0:
-            raise ValueError("the weights must not be negative")
+    class_weight: NotNegative = 1.0  # of the focal loss of the classes
+    location_weight: NotNegative = 2.0  # of the L1 loss of the things' locations
+    dice_weight: NotNegative = 1.0  # of the dice loss of the masks
+    pixel_weight: NotNegative = 10.0  # of the focal loss of the masks, averaged over the cells of a mask
 
 
 def segmentation_loss(

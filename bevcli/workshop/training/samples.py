@@ -36,6 +36,7 @@ from bevcli.inference.preprocess import Preprocessor, write_network_image
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.step import ModelInputs, PreparedFrame, joined_inputs, model_inputs
 from bevcli.model.upload import pinned, tensors_in, upload
+from bevcli.parsing.documents import Count, Share
 from bevcli.printing import counted
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.synth.drives import Drives, InputShape
@@ -60,17 +61,15 @@ FREE_CLIPS = 64  # for so many, that folder has to have space
 class ClipConfig:
     """The [training.clips] table."""
 
-    frames: int = 3  # frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history
-    batch: int = 4  # clips of a batch
-    short_share: float = 0.1  # of the batches, with shorter clips, because each scene starts without history
+    frames: Count = 3  # frames of a clip. The paper's base model uses 4, tiny and small use 3; 1 trains without history
+    batch: Count = 4  # clips of a batch
+    short_share: Share = 0.1  # of the batches, with shorter clips, because each scene starts without history
     learn: Literal["last", "all"] = "last"  # frames of a clip to train on; "last" as published
-    in_turn: int = 1  # with "all", batches a step, whose updates alternate: successive ones see other streets
+    in_turn: Count = 1  # with "all", batches a step, whose updates alternate: successive ones see other streets
 
     def __post_init__(self) -> None:
-        if min(self.frames, self.batch) < 1 or not 0 <= self.short_share <= 1:
-            raise ValueError("frames and batch must be positive, short_share from 0 to 1")
-        if self.in_turn < 1 or (self.in_turn > 1 and self.learn != "all"):
-            raise ValueError('in_turn must be positive, and 1 unless learn is "all"')
+        if self.in_turn > 1 and self.learn != "all":
+            raise ValueError('in_turn must be 1 unless learn is "all"')
 
     @property
     def updates(self) -> int:

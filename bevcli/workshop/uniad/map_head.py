@@ -19,6 +19,7 @@ from bevcli.model.decoder import DecoderConfig, best_classes
 from bevcli.model.deformable_attention import DeformableAttention, LevelShapes, sampling_locations
 from bevcli.model.encoder import FeedForward, normalized_centers
 from bevcli.model.segmentation import LocationDecoder, map_of_layers, split_heads
+from bevcli.parsing.documents import Count, ShareBelowOne
 
 NORM_EPS = 1e-6
 TEMPERATURE = 10_000.0  # of the sine position embedding
@@ -31,21 +32,21 @@ class MapHeadConfig:
 
     stuff: tuple[str, ...] = ("drivable_area",)  # classes with one mask each
     things: tuple[str, ...] = ("divider", "pedestrian_crossing", "contour")  # in the order of the logits
-    thing_queries: int = 300  # T, the number of thing queries
-    max_things: int = 100  # K, the number of pairs of a query and a class that get a mask, those with the best scores
-    encoder_layers: int = 6  # layers of the encoder
-    location_layers: int = 6  # layers of the location decoder
-    thing_mask_layers: int = 4  # layers of the mask decoder of things
-    stuff_mask_layers: int = 6  # layers of the mask decoder of stuff
-    attention_heads: int = 8  # heads of all attentions
-    points: int = 4  # sampling points of a head of the deformable attentions
+    thing_queries: Count = 300  # T, the number of thing queries
+    max_things: Count = 100  # K, the number of pairs of a query and a class that get a mask, those with the best scores
+    encoder_layers: Count = 6  # layers of the encoder
+    location_layers: Count = 6  # layers of the location decoder
+    thing_mask_layers: Count = 4  # layers of the mask decoder of things
+    stuff_mask_layers: Count = 6  # layers of the mask decoder of stuff
+    attention_heads: Count = 8  # heads of all attentions
+    points: Count = 4  # sampling points of a head of the deformable attentions
     # feature levels that the deformable attentions are built for. The map head has one map, so 1 is plain deformable
     # attention. The published weights were trained with 4, where `FlatListAttention` reads offsets and weights in
     # another order
-    attention_levels: int = 4
-    feed_forward_width: int = 512  # channels inside the feed-forward networks of encoder and location decoder
-    mask_feed_forward_width: int = 1024  # channels inside the feed-forward networks of the mask decoders
-    dropout: float = 0.1  # probability in encoder and location decoder, 0 to below 1
+    attention_levels: Count = 4
+    feed_forward_width: Count = 512  # channels inside the feed-forward networks of encoder and location decoder
+    mask_feed_forward_width: Count = 1024  # channels inside the feed-forward networks of the mask decoders
+    dropout: ShareBelowOne = 0.1  # probability in encoder and location decoder
     min_mask: float = 0.5  # value of a mask above which a cell belongs to it
     min_score: float = 0.1  # things with a lower score are left out
     max_overlap: float = 0.4  # a thing is left out if a larger share of its cells belongs to things with better scores
@@ -57,13 +58,8 @@ class MapHeadConfig:
             raise ValueError(
                 f"stuff and things need at least one class each, together at most {MOST_MAP_CLASSES}, and none twice"
             )
-        counts = (self.thing_mask_layers, self.stuff_mask_layers, self.attention_levels, self.mask_feed_forward_width)
-        if min(counts) < 1 or not 1 <= self.max_things <= self.thing_queries * len(self.things):
-            raise ValueError(
-                "layers, attention_levels and mask_feed_forward_width must be positive, and max_things from 1 to the "
-                "number of pairs of a query and a class"
-            )
-        self.transformer(min(self.encoder_layers, self.location_layers))  # checks the other numbers
+        if self.max_things > self.thing_queries * len(self.things):
+            raise ValueError("max_things must be at most the number of pairs of a query and a class")
 
     @property
     def classes(self) -> tuple[str, ...]:

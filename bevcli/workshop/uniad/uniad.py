@@ -23,6 +23,7 @@ from bevcli.model.network import STAGES
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.step import ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import exchanged, tensors_in, upload, without_autocast
+from bevcli.parsing.documents import Count, Positive, Share
 from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map
 
 NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego query
@@ -32,21 +33,18 @@ NO_TRACK, EGO = -1, -2  # ids of queries that belong to no track, and of the ego
 class TrackQueryConfig:
     """The life of tracks, and the modules that update their queries."""
 
-    birth_score: float = 0.4  # a query with it or more starts a track; a track's misses are forgotten
-    keep_score: float = 0.35  # below this score a track has a miss, and is not given out
-    max_misses: int = 5  # the track ends with this miss
-    memory_length: int = 4  # number of embeddings that a track remembers
-    memory_interval: int = 4  # a track saves its embedding at its first frame and then at every such frame
-    attention_heads: int = 8  # of the memory's attention and of the query interaction
-    center_range_m: tuple[float, float, float] = (61.2, 61.2, 10.0)  # of boxes, |x|, |y|, |z|, bev frame
+    birth_score: Share = 0.4  # a query with it or more starts a track; a track's misses are forgotten
+    keep_score: Share = 0.35  # below this score a track has a miss, and is not given out
+    max_misses: Count = 5  # the track ends with this miss
+    memory_length: Count = 4  # number of embeddings that a track remembers
+    memory_interval: Count = 4  # a track saves its embedding at its first frame and then at every such frame
+    attention_heads: Count = 8  # of the memory's attention and of the query interaction
+    center_range_m: tuple[Positive, Positive, Positive] = (61.2, 61.2, 10.0)  # of boxes, |x|, |y|, |z|, bev frame
     box_z: Literal["center", "bottom"] = "bottom"  # height that the box codes state; "bottom" in the released code
 
     def __post_init__(self) -> None:
-        if not 0 <= self.keep_score <= self.birth_score <= 1:
-            raise ValueError("keep_score and birth_score must be 0 to 1, keep_score not above birth_score")
-        counts = (self.max_misses, self.memory_length, self.memory_interval, self.attention_heads)
-        if min(counts) < 1 or min(self.center_range_m) <= 0:
-            raise ValueError("max_misses, memory_length, memory_interval, heads and center_range_m must be positive")
+        if self.keep_score > self.birth_score:
+            raise ValueError("keep_score must not be above birth_score")
 
 
 @dataclass(frozen=True)

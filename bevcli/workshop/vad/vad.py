@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from msgspec import Meta
 from torch import Tensor, nn
 
 from bevcli.errors import ConfigError
@@ -32,6 +33,7 @@ from bevcli.model.network import STAGES
 from bevcli.model.step import ModelOutputs
 from bevcli.model.temporal_model import OfficialNames, Renames
 from bevcli.model.upload import without_autocast
+from bevcli.parsing.documents import Count, Positive, ShareBelowOne
 from bevcli.workshop.formats.map_lines import MapLines
 from bevcli.workshop.vad.plan import Plan
 
@@ -41,19 +43,18 @@ class LineDecoderConfig:
     """The map decoder."""
 
     classes: tuple[str, ...] = ("divider", "ped_crossing", "boundary")  # of the lines, in the order of the class logits
-    lines: int = 100  # number of line queries
-    line_points: int = 20  # number of points of a line
-    layers: int = 3  # number of decoder layers
-    attention_heads: int = 8  # heads of self-attention and of cross-attention
-    points: int = 4  # sampling points of a head of the cross-attention to the BEV map
-    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward network
-    dropout: float = 0.1  # probability, 0 to below 1
-    max_lines: int = 50  # number of lines that are decoded, those with the best scores
+    lines: Count = 100  # number of line queries
+    line_points: Annotated[int, Meta(ge=2)] = 20  # number of points of a line
+    layers: Count = 3  # number of decoder layers
+    attention_heads: Count = 8  # heads of self-attention and of cross-attention
+    points: Count = 4  # sampling points of a head of the cross-attention to the BEV map
+    feed_forward_width: Count = 512  # channels between the two linear layers of the feed-forward network
+    dropout: ShareBelowOne = 0.1  # probability
+    max_lines: Count = 50  # number of lines that are decoded, those with the best scores
 
     def __post_init__(self) -> None:
-        if not self.classes or min(self.lines, self.max_lines) < 1 or self.line_points < 2:
-            raise ValueError("expected at least one class, one line and two line_points")
-        self.transformer()  # checks the other numbers
+        if not self.classes:
+            raise ValueError("expected at least one class")
 
     def transformer(self) -> DecoderConfig:
         """The settings of the layers, which are those of the object decoder."""
@@ -128,19 +129,14 @@ class LineEncoder(nn.Module):
 class MotionConfig:
     """The motion head and the planner."""
 
-    modes: int = 6  # M, number of futures of an object
-    steps: int = 6  # T, number of steps of a future and of a planned path
-    step_s: float = 0.5  # seconds of a step
-    attention_heads: int = 8  # heads of the four attentions
-    feed_forward_width: int = 512  # channels between the two linear layers of the feed-forward networks
-    dropout: float = 0.1  # probability, 0 to below 1
+    modes: Count = 6  # M, number of futures of an object
+    steps: Count = 6  # T, number of steps of a future and of a planned path
+    step_s: Positive = 0.5  # seconds of a step
+    attention_heads: Count = 8  # heads of the four attentions
+    feed_forward_width: Count = 512  # channels between the two linear layers of the feed-forward networks
+    dropout: ShareBelowOne = 0.1  # probability
     min_line_score: float = 0.5  # objects attend to lines with a higher score
     max_line_distance: float = 0.2  # objects attend to lines up to it, in shares of the range of the BEV grid
-
-    def __post_init__(self) -> None:
-        counts = (self.modes, self.steps, self.attention_heads, self.feed_forward_width)
-        if min(counts) < 1 or self.step_s <= 0 or not 0 <= self.dropout < 1:
-            raise ValueError("modes, steps, step_s, heads and width must be positive, dropout from 0 to below 1")
 
     def attention(self, channels: int) -> "AttentionLayer":
         """An attention layer with these settings."""
