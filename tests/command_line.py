@@ -2,9 +2,11 @@
 
 import contextlib
 import os
+import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 from unittest.mock import patch
@@ -78,6 +80,17 @@ def invoked(*arguments: object, code: int = 0) -> Result:
     result = CliRunner().invoke(main.app, [*map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == code, result.output
     return result
+
+
+@contextlib.contextmanager
+def full_disk(most: int) -> Iterator[None]:
+    """A limit on the size of files in bytes, which to a program that writes is what a full disk is."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def flushed(file: IO[str]) -> str:

@@ -1,5 +1,6 @@
 """Known predictions and ground truth for a sequence in memory, and a recording of them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,13 +11,14 @@ from memory_drive import MemoryDrive
 
 from bevcli.config import load_config
 from bevcli.errors import OutputError
-from bevcli.frame import AttentionView, CameraSamples, Frame, NewStart, Prediction, Probe, StartReason
+from bevcli.frame import AttentionView, CameraSamples, Drive, Frame, NewStart, Prediction, Probe, StartReason
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import inverse
 from bevcli.model.config import ModelConfig
 from bevcli.recording import RecordingOptions
 from bevcli.recording.writer import Recording
+from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.viewer.rerun_viewer import NO_DRIVER, take_screenshot
 
 GRID = BevGrid(20, 20)
@@ -84,10 +86,22 @@ def record(
     """Writes a recording of the whole sequence, by default with ground truth; returns its frames."""
     frames = [sequence.load(place) for place in range(len(sequence.stamps))]
     frames = [with_truth(frame) for frame in frames] if truth else frames
-    with Recording(path, sequence, NamedModel(untrained), options) as recording:
-        for frame in frames:
-            recording.log(frame, predict(frame))
+    recorded(path, sequence, ((frame, predict(frame)) for frame in frames), NamedModel(untrained), options)
     return frames
+
+
+def recorded(
+    path: Path,
+    drive: Drive,
+    steps: Iterable[tuple[Frame, Prediction]],
+    model: NamedModel | None = None,
+    options: RecordingOptions | None = None,
+) -> list[RecordedFrame]:
+    """Writes a recording of these frames; returns them as they are read back."""
+    with Recording(path, drive, model or NamedModel(), options) as recording:
+        for frame, prediction in steps:
+            recording.log(frame, prediction)
+    return list(RecordingReader(path).frames())
 
 
 def bev_from_world(frame: Frame) -> np.ndarray:

@@ -3,7 +3,7 @@
 import datetime
 import json
 import math
-import pickle
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -184,9 +184,9 @@ def test_the_nearest_model_and_the_difference_are_named(demo_state: dict, tmp_pa
     for text, state in cases.items():
         path = tmp_path / "w.safetensors"
         safetensors.torch.save_file(state, path)
-        with pytest.raises(WeightsError) as caught:
+        expected = re.escape(f"fits none of the known models; nearest is demo: {text}: ")
+        with pytest.raises(WeightsError, match=expected):
             convert(path, tmp_path / "out.safetensors")
-        assert f"fits none of the known models; nearest is demo: {text}: " in str(caught.value)
     assert not (tmp_path / "out.safetensors").exists()
 
 
@@ -280,30 +280,13 @@ def test_weights_of_another_model_are_refused_and_named(official_tiny: Path) -> 
     assert all(torch.equal(tensor, untouched[key]) for key, tensor in model.state_dict().items())
 
 
-class Evil:
-    """An object that runs code when it is unpickled."""
-
-    def __reduce__(self) -> tuple[object, tuple[str]]:
-        return print, ("ran",)
-
-
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
 @pytest.mark.parametrize("contents", [b"", b"hello, I am a text\n", b"\x00" * 100, b"PK\x03\x04broken", b"\x80\x02."])
 def test_a_file_that_does_not_contain_weights_is_an_error(tmp_path: Path, suffix: str, contents: bytes) -> None:
     path = tmp_path / f"file{suffix}"
     path.write_bytes(contents)
-    with pytest.raises(WeightsError) as caught:
+    with pytest.raises(WeightsError, match=rf"file\{suffix}: "):
         read_checkpoint(path)
-    assert f"file{suffix}: " in str(caught.value)
-
-
-def test_code_in_a_file_is_an_error_and_does_not_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    torch.save({"state_dict": {"weight": Evil()}}, tmp_path / "a.pth")
-    (tmp_path / "b.pth").write_bytes(pickle.dumps({"state_dict": {"weight": Evil()}}))
-    for name in ("a.pth", "b.pth"):
-        with pytest.raises(WeightsError, match="safe to read"):
-            read_checkpoint(tmp_path / name)
-    assert "ran" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("contents", [3, [1, 2], {}, {"state_dict": {}}, {"state_dict": {"a": 1}}])

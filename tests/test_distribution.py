@@ -39,7 +39,7 @@ EXTRAS = "ros,video,onnx,openvino,tensorboard,ray,hub"
 # These tests run with the lowest versions, too. They use OpenCV, numba, PyTorch, SciPy, Shapely, trimesh, rerun, mcap,
 # rosbags, protobuf, PyAV, ONNX and its runtime, and OpenVINO.
 WITH_LOWEST = (
-    "geometry/test_cameras.py",
+    "geometry/test_transforms.py",
     "model/test_deformable_attention.py",
     "inference/test_tracking.py",
     "sequences/test_write_nuscenes.py",

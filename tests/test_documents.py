@@ -1,15 +1,18 @@
-"""Every command, option and path that a document names exists, and the examples run and are typed.
+"""Every command, option, key and path that a document names exists; docs/bevformer.md agrees with the models.
 
-`make docs` checks the links.
+The examples run and are typed. `make docs` checks the links.
 """
 
 import contextlib
+import dataclasses
 import os
 import re
 import runpy
 import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from runpy import run_path
@@ -17,10 +20,15 @@ from textwrap import dedent
 from typing import Any
 
 import pytest
+import torch
 import typer
 
 import bevcli
 from bevcli.cli.main import app
+from bevcli.config import load_config
+from bevcli.model.bevformer import BEVFormer
+from bevcli.workshop.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
+from bevcli.workshop.training.job import TrainingConfig
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
@@ -160,11 +168,11 @@ def test_reference_names_every_public_name():
         bevcli.no_such_name  # noqa: B018
 
 
-PAGE = (ROOT / "docs" / "python.md").read_text()
-EXAMPLES = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+PYTHON_PAGE = (ROOT / "docs" / "python.md").read_text()
+EXAMPLES = re.findall(r"^```python\n(.*?)^```", PYTHON_PAGE, flags=re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.slow  # test_readme.py and the tests of each function run its calls
+@pytest.mark.slow  # test_pages.py and the tests of each function run its calls
 def test_the_examples_run(clone: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(EXAMPLES) > 8
     with contextlib.chdir(clone):
@@ -206,3 +214,176 @@ def test_the_examples_pass_mypy_strict(tmp_path: Path) -> None:
     environment = os.environ | {"MYPYPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def defaults(config: object, table: str = "") -> Iterator[tuple[str, object]]:
+    """Key, with the names of its tables, and default value."""
+    for field in dataclasses.fields(config):  # type: ignore[arg-type]
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from defaults(value, f"{table}{field.name}.")
+        else:
+            yield f"{table}{field.name}", value
+
+
+def documented() -> Iterator[tuple[str, object]]:
+    """Key and default value of each entry of the document's table. A key ".name" is in the table of the key before."""
+    section = (DOCS / "training.md").read_text().partition("## The `[training]` table")[2].partition("\n## ")[0]
+    for row in re.findall(r"^\| (`.*?) \| (.*?) \|", section, flags=re.MULTILINE):
+        table = ""
+        for key, value in zip(row[0].split(", "), row[1].split(", "), strict=True):
+            name = key.strip("`")
+            name = table + name if name.startswith(".") else name
+            table = name.rpartition(".")[0]
+            yield name, parsed(value)
+
+
+def parsed(value: str) -> object:
+    if value.startswith('"'):
+        return value.strip('"')
+    if value in ("true", "false"):
+        return value == "true"
+    if " to " in value or "; " in value:  # a range, or a list
+        return tuple(float(number) for number in re.split(" to |; ", value))
+    return float(Fraction(value))
+
+
+def test_the_table_lists_every_key_with_its_default() -> None:
+    expected = {key: with_floats(value) for key, value in defaults(TrainingConfig())}
+    assert dict(documented()) == expected
+
+
+def with_floats(value: object) -> object:
+    if isinstance(value, tuple):
+        return tuple(float(number) for number in value)
+    return float(value) if type(value) in (int, float) else value
+
+
+PAGE = ROOT / "docs/bevformer.md"
+TEXT = PAGE.read_text(encoding="utf-8")
+CAMERAS = 6
+MODELS = ("tiny", "base")
+V2_MODELS = ("v2-t1", "v2-t2", "v2-t8")
+
+
+def table_rows(models: tuple[str, ...]) -> dict[str, dict[str, str]]:
+    """Name of a tensor or part -> model -> what the page states, in the tables of these models."""
+    rows = {}
+    for line in TEXT.splitlines():
+        cells = [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+        titles = ("tensor", "part", "tensor of V2", "---")
+        if line.startswith("|") and len(cells) == 1 + len(models) and cells[0] not in titles:
+            assert cells[0] not in rows, f"{cells[0]} stands in two tables"
+            rows[cells[0]] = dict(zip(models, cells[1:], strict=True))
+    return rows
+
+
+def facts_of_v2(name: str) -> dict[str, str]:
+    """What the page should state of a BEVFormerV2."""
+    config = load_config(name)
+    assert isinstance(config, BEVFormerV2Config)
+    width, height = config.image.padded_size
+    count, cells = len(config.frames), config.bev_grid.rows * config.bev_grid.columns
+    with torch.device("meta"), torch.inference_mode():
+        model = BEVFormerV2(config).eval()
+        images = torch.zeros(1, CAMERAS, 3, height, width)
+        tokens = model.image_features(images, torch.arange(CAMERAS)).tokens
+        maps = torch.zeros(count, cells, config.channels)
+        fused = None if model.fusion is None else model.fusion(list(maps[:, None]))[0]
+    remembered = config.past_frames
+    return {
+        "cropped images": str(tuple(images[0].shape)),
+        "tokens of a frame": str(tuple(tokens.shape)),
+        "maps of the window": str(tuple(maps.shape)),
+        "input of the fusion": "–"
+        if model.fusion is None
+        else f"({count * config.channels}, {config.bev_grid.rows}, {config.bev_grid.columns})",
+        "output of the fusion": "–" if fused is None else str(tuple(fused.shape)),
+        "parameters of the fusion": "–"
+        if model.fusion is None
+        else f"{sum(parameter.numel() for parameter in model.fusion.parameters()):,}",
+        "remembered frames": str(remembered),
+        "memory of the window, float32": f"{remembered * tokens.numel() * 4 / 1e6:.0f} MB",
+    }
+
+
+def facts_of(name: str) -> dict[str, str]:
+    """What the page should state of a model, from its modules on the meta device and from its configuration."""
+    config = load_config(name)
+    grid, channels = config.bev_grid, config.channels
+    width, height = config.image.padded_size
+    with torch.device("meta"), torch.inference_mode():
+        model = BEVFormer(config).eval()
+        images = torch.zeros(CAMERAS, 3, height, width)
+        stages = model.backbone(images)
+        levels = model.neck(stages)
+        tokens = model.image_tokens(levels, torch.arange(CAMERAS)).tokens
+        queries = model.bev_queries(torch.zeros(1, 18))[0]
+        position = model.bev_queries.position()
+        can_bus = model.bev_queries.can_bus_embedding(torch.zeros(1, 18))[0]
+        class_logits, box_codes, _ = model.decoder(queries[None], model.detection_head)
+        object_position = model.decoder.query_embedding[:, :channels]
+        references = model.decoder.reference_points(object_position)
+    pillars = grid.pillars().reshape(-1, grid.pillar_points, 3)
+    encoder, decoder = config.encoder, config.decoder
+    spatial = (encoder.attention_heads, config.neck.levels, encoder.spatial_points)
+    temporal = (encoder.attention_heads, 2, 1, encoder.temporal_points, 2)
+    layer = model.encoder.layers[0]
+    assert torch.Size((*spatial, 2)).numel() == layer.spatial_cross_attention.attention.sampling_offsets.out_features
+    assert torch.Size(temporal).numel() == layer.temporal_self_attention.attention.sampling_offsets.out_features
+    stage_of = dict(zip(config.backbone.output_stages, stages, strict=True))
+    shapes = {
+        "images": images.shape,
+        **{f"backbone, stage {stage}": stage_of[stage].shape if stage in stage_of else None for stage in (2, 3, 4)},
+        **{f"neck, level {i + 1}": levels[i].shape if i < len(levels) else None for i in range(4)},
+        "image tokens": tokens.shape,
+        "BEV queries": queries.shape,
+        "column embedding": model.bev_queries.column_embedding.shape,
+        "row embedding": model.bev_queries.row_embedding.shape,
+        "position embedding": position.shape,
+        "can-bus numbers": (18,),
+        "can-bus embedding": can_bus.shape,
+        "shift": (2,),
+        "pillar points": pillars.shape,
+        "projection matrices": (CAMERAS, 4, 4),
+        "reference points in the images": (CAMERAS, len(pillars), grid.pillar_points, 2),
+        "spatial sampling points of a cell in a camera": (*spatial, 2),
+        "spatial attention weights of a cell in a camera": spatial,
+        "history BEV map": queries.shape,
+        "temporal value maps": (2, *queries.shape),
+        "temporal sampling points of a cell": temporal,
+        "BEV map": queries.shape,
+        "object queries": model.decoder.query_embedding.shape,
+        "object reference points": references.shape,
+        "class logits": class_logits[:, 0].shape,
+        "box codes": box_codes[:, 0].shape,
+    }
+    facts = {label: "–" if shape is None else str(tuple(shape)) for label, shape in shapes.items()}
+    facts["encoder layers"] = str(len(model.encoder.layers))
+    facts["feed-forward width"] = str(layer.feed_forward.expand.out_features)
+    facts["decoder layers"] = str(len(model.decoder.layers))
+    facts["boxes kept"] = str(decoder.max_boxes)
+    for part, module in model.named_children():
+        if parameters := sum(parameter.numel() for parameter in module.parameters()):
+            facts[part] = f"{parameters:,}"
+    facts["all"] = f"{sum(parameter.numel() for parameter in model.parameters()):,}"
+    return facts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
+def test_the_tables_state_the_shapes_and_sizes_of_the_models(model):
+    assert {label: stated[model] for label, stated in table_rows(MODELS).items()} == facts_of(model)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", V2_MODELS)
+def test_the_table_of_v2_states_shapes_and_sizes_of_its_models(model):
+    assert {label: stated[model] for label, stated in table_rows(V2_MODELS).items()} == facts_of_v2(model)
+
+
+def test_named_classes_and_functions_are_in_the_linked_files():
+    named = re.findall(r"`(\w+)` in\s+\[[^\]]+\]\(\.\./([^)]+\.py)\)", TEXT)
+    assert len(named) > 20
+    for name, file in named:
+        assert re.search(rf"^(class|def) {name}\b", (ROOT / file).read_text(), re.MULTILINE), f"{name} in {file}"

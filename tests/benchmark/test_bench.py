@@ -14,9 +14,11 @@ from command_line import invoked
 from bevcli.config import load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import installed_engines
+from bevcli.inference.preprocess import Preprocessor
+from bevcli.model.pillar_projection import find_hits, project_pillars
 from bevcli.workshop.benchmark import measure, versions
 from bevcli.workshop.benchmark.measure import BenchmarkResult, MachineLimits, count_operations
-from bevcli.workshop.benchmark.versions import Comparison
+from bevcli.workshop.benchmark.versions import Comparison, MadeUpDrive, made_up_model
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -149,3 +151,20 @@ def test_tiny_needs_slightly_more_operations_than_six_resnet50():
     resnet50 = 2 * 4.09e9  # for one image of 224 x 224, as published with the weights
     backbone = 6 * resnet50 * (480 * 800) / 224**2
     assert 1.02 * backbone < count_operations(load_config("tiny"), (400,) * 6) < 1.12 * backbone
+
+
+@pytest.mark.slow
+def test_the_cameras_see_about_as_many_cells_as_nuscenes():
+    config = load_config("tiny")
+    prepared = Preprocessor(config)(MadeUpDrive(1).load(0))
+    pillars = torch.as_tensor(config.bev_grid.pillars()).float().flatten(0, 1)
+    hits = find_hits(project_pillars(prepared.image_from_bev, pillars, (480, 800), prepared.has_image))
+    # 2812 in a real nuScenes frame, the first of the reference numbers.
+    assert 0.95 * 2812 < sum(hits.hits_per_camera) < 1.05 * 2812
+
+
+def test_no_matrix_is_zero_and_every_call_gives_the_same_weights(mini_config):
+    model, again = made_up_model(mini_config), made_up_model(mini_config)
+    assert all(parameter.any() for parameter in model.parameters() if parameter.ndim > 1)
+    state = again.state_dict()
+    assert all(torch.equal(tensor, state[name]) for name, tensor in model.state_dict().items())

@@ -1,4 +1,4 @@
-"""Residuals, levels and paths against points projected by hand; cameras that see the same at once, or nothing."""
+"""Residuals, levels and paths against points projected by hand; cameras that see the same at once; features."""
 
 from dataclasses import replace
 
@@ -13,7 +13,15 @@ from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import DELAYS_S, HEIGHT, OF_CAMERA, Unknowns
 from bevcli.workshop.calibration.road import followed, level_corrections, sees_road
 from bevcli.workshop.calibration.views import PointMatches, View, Views, depths_of, unknowns_of
-from bevcli.workshop.correspondence.images import FEWEST_AT_ONCE, Features, matched, points_of_road, texture
+from bevcli.workshop.correspondence.images import (
+    FEWEST_AT_ONCE,
+    Features,
+    GreyImage,
+    features,
+    matched,
+    points_of_road,
+    texture,
+)
 from bevcli.workshop.correspondence.residuals import (
     EpipolarResiduals,
     RoadResiduals,
@@ -277,3 +285,28 @@ def test_a_road_of_stripes_does_not_show_a_wrong_roll(striped, least, most):
     unknowns = unknowns_of(views, CalibrateOptions())
     [share] = followed(views, unknowns, np.zeros(len(unknowns.deviations)), 12.0, np.zeros(1))
     assert least < share < most
+
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (30, 40)).repeat(6, axis=0).repeat(6, axis=1).astype(np.uint8)
+LEFT = np.arange(240) < 120
+
+
+@pytest.mark.parametrize("brightness", [0, 90])
+def test_texture_is_that_of_what_is_seen(brightness):
+    """And not of the brightness beside it, which is what an image has where no camera looks."""
+    seen = np.broadcast_to(LEFT, PIXELS.shape)
+    found = texture(np.where(seen, PIXELS, brightness).astype(np.uint8), seen)
+    assert (found[:, 120:] == 128).all()
+    assert np.abs(found[:, :98].astype(int) - texture(PIXELS)[:, :98]).max() <= 1  # the rest is near the edge
+
+
+def test_texture_does_not_depend_on_light():
+    assert np.abs(texture(PIXELS // 2 + 60).astype(int) - texture(PIXELS)).max() < 8
+
+
+def test_features_are_those_of_what_is_seen():
+    image = GreyImage(PIXELS, texture(PIXELS))
+    found = features(image, np.broadcast_to(LEFT, PIXELS.shape))
+    everywhere = features(image)
+    assert 50 < len(found.pixels) < len(everywhere.pixels)
+    assert found.pixels[:, 0].max() < 121

@@ -171,31 +171,26 @@ def test_a_deleted_output_folder_is_an_error_of_one_line(place):
     assert not out.exists()
 
 
-def check_kills(folder: Path, kills: int, duration_s: float) -> None:
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_hundred_kills_lose_no_finished_frame(place):
     """Kills at random moments, the first and the second after a frame.
 
     Every second run is resumed and killed again, the others start anew.
     """
-    randomness = random.Random(19)
-    found = []
-    for number in range(kills):
-        out, how = (folder / "killed", "--force") if number % 2 else (folder / "resumed", "--resume")
-        run = Run(folder, out, how)
+    duration_s, randomness, found = complete(place, place / "timed"), random.Random(19), []
+    for number in range(100):
+        out, how = (place / "killed", "--force") if number % 2 else (place / "resumed", "--resume")
+        run = Run(place, out, how)
         if number < 2:
             wait_for_frames(run, out, randomness.randrange(1, FRAMES // 2))
         else:
             run.process.join(randomness.uniform(0.2, 1.0) * duration_s)
         run.process.kill()
         run.process.join(10)
-        found.append(assert_finished_frames_are_whole(out, folder) if out.exists() else 0)
+        found.append(assert_finished_frames_are_whole(out, place) if out.exists() else 0)
         if finished(out) == FRAMES:
             shutil.rmtree(out)
     assert max(found) > 0
-    complete(folder, folder / "resumed", "--resume")
-    assert_equals_whole(folder / "resumed", folder)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_a_hundred_kills_lose_no_finished_frame(place):
-    check_kills(place, 100, complete(place, place / "timed"))
+    complete(place, place / "resumed", "--resume")
+    assert_equals_whole(place / "resumed", place)

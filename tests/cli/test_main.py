@@ -37,9 +37,7 @@ def test_a_mistake_in_usage_exits_2():
     ("arguments", "message"),
     [
         (("run", "nowhere", "--untrained"), "nowhere"),
-        (("run", str(SAMPLE), "--model", "tinny", "--untrained"), "tinny"),
         (("run", str(SAMPLE), "--model", "tiny"), "--untrained"),
-        (("weights", "inspect", "nowhere.pth"), "nowhere.pth"),
     ],
 )
 def test_a_mistake_in_the_input_is_one_line_and_exits_1(arguments, message, tmp_path):

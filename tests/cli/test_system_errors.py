@@ -2,13 +2,12 @@
 
 import marshal
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from command_line import command
+from command_line import command, full_disk
 
 from bevcli.cli import main
 from bevcli.errors import OutputError
@@ -94,13 +93,8 @@ def test_other_errors_are_bugs_and_have_tracebacks(tmp_path, monkeypatch):
 
 def test_weights_on_a_full_disk_are_one_line(tmp_path):
     demo = Path(main.__file__).parents[1] / "weights/demo.safetensors"
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
-    try:
-        with pytest.raises(OutputError, match=r"out\.safetensors: cannot be written"):
-            convert(demo, tmp_path / "out.safetensors")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with full_disk(10_000), pytest.raises(OutputError, match=r"out\.safetensors: cannot be written"):
+        convert(demo, tmp_path / "out.safetensors")
     assert list(tmp_path.iterdir()) == []
 
 

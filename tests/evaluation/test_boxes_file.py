@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from random_boxes import as_predictions, random_truth
+from made_boxes import as_predictions, random_truth
 
 from bevcli.errors import InputError, OutputError
 from bevcli.frame import FrameStamp

@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import invoked
-from made_boxes import made_boxes
-from random_boxes import as_predictions, random_truth
+from made_boxes import as_predictions, made_boxes, random_truth
 from sequences.nuscenes_tables import Size, write_tables
 from test_eval_command import evaluated, write_frames
 

@@ -1,25 +1,32 @@
-"""UniAD's first stage equals the released code (float32, CPU); its tracks, the memory bank, and expected places.
+"""UniAD's first stage and its map head equal the released code (float32, CPU); tracks, memory bank, expected places.
 
 golden_uniad_tracks.npz in tests/data holds a part of the original tracker's numbers over 19 frames with given BEV maps:
-births, misses, deaths, full memories and a scene change. The full numbers, and those of the whole model over four
-frames, are in the folder golden/ of BEVCLI_SHARED.
+births, misses, deaths, full memories and a scene change. golden_uniad_map.npz holds a part of its numbers for one BEV
+map: the encoder's output at every 592nd cell, every 15th thing query, every fifth mask at every eighth cell, and the
+merged map. The full numbers, and those of the whole model over four frames, are in the folder golden/ of BEVCLI_SHARED.
 """
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import original_reference as original
 import pytest
 import torch
 import uniad_reference as reference
-from uniad_rule import rule_bev
+from uniad_reference import rule_bev, uniad_state
 
+from bevcli.checkpoints import from_official
+from bevcli.geometry.bev_grid import BevGrid
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z, rotation_from_quaternion
+from bevcli.model.deformable_attention import DeformableAttention
+from bevcli.model.kernels.compiled import CompiledSampling
+from bevcli.model.kernels.onednn import use_onednn
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.workshop.uniad.map_head import merge_map
+from bevcli.workshop.uniad.map_head import MapHead, MapHeadConfig, MapOutputs, merge_map, thing_scores
 from bevcli.workshop.uniad.uniad import (
     EGO,
     NO_TRACK,
@@ -198,3 +205,97 @@ def test_a_standing_object_is_expected_where_the_vehicle_sees_it() -> None:
     matrix = torch.from_numpy(np.linalg.inv(previous_from_now)).float()
     found = expected_centers(codes((0, 10, -1, 0, 0)), FrameMotion(matrix, 0.5))
     assert found[0].tolist() == pytest.approx([6, 0, -1], abs=1e-5)
+
+
+KEPT_MAP = np.load(original.DATA / "golden_uniad_map.npz")
+FRAME = 5
+GRID, MAP_CONFIG = BevGrid(200, 200), MapHeadConfig()
+PREFIX = "map_head."
+
+
+class Step(NamedTuple):
+    """What the head computed.
+
+    Attributes:
+        outputs: of the head.
+        memory: (Y·X, C) of the encoder.
+        queries: (T, C) of the location decoder.
+        things: (K, C) of the last layer of the things' mask decoder.
+        stuff: (S, C) of the last layer of the stuff's mask decoder.
+    """
+
+    outputs: MapOutputs
+    memory: torch.Tensor
+    queries: torch.Tensor
+    things: torch.Tensor
+    stuff: torch.Tensor
+
+
+@cache
+def map_step(prepared: bool) -> Step:
+    """One step with weights by the rule. prepared: with the kernels of inference on a CPU."""
+    head = MapHead(MAP_CONFIG, 256, GRID).eval().requires_grad_(False)
+    state = from_official(uniad_state("seg_head."))[0]
+    head.load_state_dict({key.removeprefix(PREFIX): tensor for key, tensor in state.items()})
+    parts = (head.encoder, head.location_decoder.layers[-1], head.thing_masks.layers[-1], head.stuff_masks.layers[-1])
+    found: dict[int, torch.Tensor] = {}
+    for index, part in enumerate(parts):
+        part.register_forward_hook(lambda *call, index=index: found.update({index: call[-1][0].clone()}))
+    if prepared:
+        use_onednn(head)
+        for module in head.modules():
+            if isinstance(module, DeformableAttention):
+                module.sampling = CompiledSampling()
+    with torch.inference_mode():
+        outputs = head(rule_bev(FRAME))
+    return Step(outputs, found[0], found[1], found[2], found[3])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("prepared", [False, True])
+def test_embeddings_things_and_masks_equal_the_originals(prepared: bool) -> None:
+    found = map_step(prepared)
+    close(found.memory[:: 37 * 16], KEPT_MAP["memory"], 1e-3)
+    close(found.queries[::15], KEPT_MAP["queries"], 1e-3)
+    close(found.outputs.class_logits[0], KEPT_MAP["class_logits"], 1e-3)
+    close(found.outputs.locations[-1, 0] * 102.4, KEPT_MAP["box"] * 102.4, 1e-2)  # metres
+    rows = matching_rows(found.outputs)
+    masks = found.outputs.thing_masks[0, rows].unflatten(-1, (200, 200))
+    close(found.outputs.scores[0, rows], KEPT_MAP["scores"], 1e-4)
+    close(found.things[rows][::5, ::4], KEPT_MAP["things"], 1e-3)
+    close(found.stuff, KEPT_MAP["stuff"], 1e-3)
+    close(masks[::5, ::8, ::8], KEPT_MAP["thing_masks"], 1e-3)
+    close(found.outputs.stuff_masks[0, 0].unflatten(-1, (200, 200))[::4, ::4], KEPT_MAP["stuff_mask"], 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("prepared", [False, True])
+def test_the_merged_map_equals_the_originals(prepared: bool) -> None:
+    outputs = map_step(prepared).outputs
+    merged = merge_map(outputs, MAP_CONFIG, GRID)
+    assert_same_cells(merged.things, np.unpackbits(KEPT_MAP["lane_bits"]).reshape(3, 200, 200))
+    assert_same_cells(merged.stuff[0], np.unpackbits(KEPT_MAP["drivable_bits"]).reshape(200, 200))
+    assert_same_cells(merged.instances, KEPT_MAP["ids"])
+    assert_same_cells(np.array([0, *merged.instance_labels])[merged.instances], KEPT_MAP["label_map"])
+    scores, order = thing_scores(outputs.thing_masks[0], outputs.scores[0], MAP_CONFIG.min_mask).sort(descending=True)
+    close(scores, KEPT_MAP["final_scores"], 2e-4)  # the class score times the square of a mean of masks
+    assert np.mean(outputs.labels[0, order].numpy() == KEPT_MAP["final_labels"]) > 0.9  # neighbours may be 4e-7 apart
+    np.testing.assert_allclose(
+        merged.instance_scores, KEPT_MAP["final_scores"][: len(merged.instance_scores)], atol=2e-4
+    )
+
+
+def matching_rows(outputs: MapOutputs) -> list[int]:
+    """For each thing that the original selected, the index of ours with its query and class."""
+    found = {
+        pair: row for row, pair in enumerate(zip(outputs.queries[0].tolist(), outputs.labels[0].tolist(), strict=True))
+    }
+    return [found[pair] for pair in zip(KEPT_MAP["index"].tolist(), KEPT_MAP["labels"].tolist(), strict=True)]
+
+
+def assert_same_cells(found: np.ndarray, expected: np.ndarray) -> None:
+    """Cells are equal, but for those where a mask is so near to its threshold that rounding decides."""
+    assert found.shape == expected.shape
+    assert np.count_nonzero(found != expected) <= 5

@@ -1,9 +1,13 @@
-"""VAD-tiny equals the released code, from images to the planned path (float32, CPU).
+"""VAD-tiny equals the released code, from images to the planned path (float32, CPU); and so does its exported form.
 
 golden_vad.npz in tests/data holds a part of the original's numbers for the first two frames; all numbers of four frames
-are in the folder golden/ of BEVCLI_SHARED.
+are in the folder golden/ of BEVCLI_SHARED. The goldens have the same rule of weights. golden_keys_vad.json has the keys
+and shapes of the official weights that BEVFormer tiny does not have with the same shape, and those of tiny that VAD
+does not have.
 """
 
+import json
+import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -12,12 +16,18 @@ import numpy as np
 import original_reference as original
 import pytest
 import torch
-from vad_rule import rule_vad, vad_shapes
+from memory_drive import MemoryDrive
+from original_reference import DATA, official_shapes
+from stated_rule import rule_tensor
 
 from bevcli.checkpoints import expected_state, from_official
 from bevcli.config import load_config
+from bevcli.inference import run
+from bevcli.inference.load import Model
 from bevcli.model.prepare import prepare_for_inference
-from bevcli.workshop.vad.vad import VAD, VADOutputs, decode_futures, decode_lines, line_positions
+from bevcli.workshop.engines.export_onnx import export_onnx
+from bevcli.workshop.engines.exported import FrameDifference, check_exported, difference_lines, load_exported
+from bevcli.workshop.vad.vad import VAD, VADConfig, VADOutputs, decode_futures, decode_lines, line_positions
 
 KEPT = np.load(original.DATA / "golden_vad.npz")
 SCENE_STARTS = (0, 3)
@@ -146,3 +156,87 @@ def test_prepared_vad_equals_all_results(shared: Path, frame: int) -> None:
     close(outputs.bev[0, ::37], expected["bev_embed_sub"], 1e-3)
     check_stages(outputs, expected)
     check_results(outputs, expected)
+
+
+STEM_GAIN = 1 / 57
+HEAD = r"pts_bbox_head\."
+ROOT = 512**0.5
+# Metres a step, x and y, of the commands right, left, straight.
+PATHS = [0.4, 2.5] * 6 + [-0.4, 2.5] * 6 + [0.0, 3.0] * 6
+# Pattern of a key, then what its tensor by the common rule is multiplied with, and what is added to that. They make
+# lines and modes differ, and put some objects and lines above the thresholds.
+_CHANGES: tuple[tuple[str, float | list[float], float | list[float]], ...] = (
+    (rf"{HEAD}cls_branches\.\d+\.6\.bias", 1.0, -1.7),
+    (rf"{HEAD}reg_branches\.\d+\.4\.weight", [0.3, 0.3, 1, 1, 0.3, 1, 1, 1, 1, 1], 0.0),
+    (rf"{HEAD}map_instance_embedding\.weight", ROOT, 0.0),
+    (rf"{HEAD}map_pts_embedding\.weight", 0.3 * ROOT, 0.0),
+    (rf"{HEAD}transformer\.map_reference_points\.weight", 2.0, 0.0),
+    (rf"{HEAD}transformer\.map_decoder\..*(attn\.out_proj|ffns\.0\.layers\.1)\.weight", 0.3, 0.0),
+    (rf"{HEAD}transformer\.map_decoder\..*output_proj\.weight", 0.4, 0.0),
+    (rf"{HEAD}map_reg_branches\.\d+\.4\.weight", 0.5, 0.0),
+    (rf"{HEAD}map_cls_branches\.\d+\.6\.bias", 1.0, -1.8),
+    (rf"{HEAD}(motion_mode|ego)_query\.weight", 16.0, 0.0),
+    (rf"{HEAD}(motion|motion_map|ego_agent|ego_map)_decoder\..*\.in_proj_weight", [2.0] * 512 + [1.0] * 256, 0.0),
+    (rf"{HEAD}ego_fut_decoder\.4\.bias", 1.0, PATHS),
+)
+
+
+def vad_shapes() -> dict[str, tuple[int, ...]]:
+    """Key -> shape of the official weights."""
+    file = json.loads((DATA / "golden_keys_vad.json").read_text())
+    of_tiny = {key: shape for key, shape in official_shapes("tiny").items() if key not in file["not_of_tiny"]}
+    return of_tiny | {key: tuple(shape) for key, shape in file["keys"].items()}
+
+
+def vad_tensor(key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A tensor of a state dict, by its official key and shape."""
+    if key.endswith("map_code_weights"):
+        return np.ones(shape, np.float32)
+    tensor = rule_tensor(key, shape, STEM_GAIN)
+    for pattern, factor, offset in _CHANGES:
+        if re.fullmatch(pattern, key):
+            rows = np.reshape(factor, (-1, *[1] * (len(shape) - 1))) if isinstance(factor, list) else factor
+            return (tensor.astype(np.float64) * rows + np.asarray(offset)).astype(np.float32)
+    return tensor
+
+
+def rule_vad() -> VAD:
+    """The whole model, in evaluation mode."""
+    config = load_config("vad-tiny")
+    assert isinstance(config, VADConfig)
+    model = VAD(config).eval()
+    state = {key: torch.from_numpy(vad_tensor(key, shape)) for key, shape in vad_shapes().items()}
+    model.load_state_dict(from_official(state)[0])
+    return model
+
+
+@pytest.mark.slow
+def test_an_exported_vad_equals_the_model(mini_vad: VAD, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "vad.onnx"
+    export_onnx(mini_vad, file)
+    exported = load_exported(file, "onnxruntime")
+    drive = MemoryDrive(3)
+    *_, last = check_exported(file, Model(mini_vad), drive)
+    assert last.further.keys() == {
+        "line_class_logits", "line_points", "future_offsets", "mode_logits", "plan_offsets"
+    }  # fmt: skip
+    assert max(last.further.values()) < 1e-3
+    for (_, ours), (_, theirs) in zip(
+        run(Model(mini_vad), drive), run(Model(exported, engine="onnxruntime", file=exported.file), drive), strict=True
+    ):
+        np.testing.assert_allclose(theirs.boxes.scores, ours.boxes.scores, atol=1e-4)
+        np.testing.assert_allclose(theirs.boxes.futures, ours.boxes.futures, atol=1e-2)
+        (lines, plan), (our_lines, our_plan) = theirs.results, ours.results
+        np.testing.assert_allclose(np.stack(lines.points), np.stack(our_lines.points), atol=1e-2)
+        assert (lines.classes == our_lines.classes).all()
+        np.testing.assert_allclose(plan.paths, our_plan.paths, atol=1e-2)
+
+
+def test_differences_of_further_outputs_have_columns() -> None:
+    frames = [
+        FrameDifference(frame, 0, 0, 0, 1, 0, 0, {"plan_offsets": value}) for frame, value in ((3, 0.5), (4, 0.1))
+    ]
+    heads, *rows = (line.split() for line in difference_lines(frames))
+    assert heads[-1] == "plan_offsets"
+    assert [(row[0], row[-1]) for row in rows] == [("3", "5.0e-01"), ("4", "1.0e-01"), ("largest", "5.0e-01")]

@@ -1,4 +1,4 @@
-"""Lines of the map, futures and planned paths in a recording: in the scene, from above and in the images."""
+"""What a recording has on the ground: lines of the map, futures, planned paths, and BEV features as images."""
 
 from dataclasses import replace
 
@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 from memory_drive import MemoryDrive
-from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict
+from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, recorded
 
 from bevcli.config import load_config
+from bevcli.errors import InputError
 from bevcli.geometry.transforms import apply
 from bevcli.recording import entities
-from bevcli.recording.log_ground import future_lines
-from bevcli.recording.writer import Recording
-from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
+from bevcli.recording.log_ground import BevImages, future_lines
+from bevcli.viewer.recording_reader import RecordedFrame
 from bevcli.workshop.formats.map_lines import MapLines, line_colors
 from bevcli.workshop.vad.plan import HALF_VEHICLE_M, Plan
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
@@ -44,13 +44,12 @@ def drive() -> MemoryDrive:
 @pytest.fixture(scope="module")
 def frames(drive: MemoryDrive, tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     """Two frames; the second has no image, and so no results."""
-    path = tmp_path_factory.mktemp("lines") / "r.rrd"
-    with Recording(path, drive, PLANNER) as recording:
-        for place, results in enumerate([(LINES, PLAN), ()]):
-            frame = drive.load(place)
-            boxes = with_futures() if results else boxes_ahead()[:0]
-            recording.log(frame, replace(predict(frame), boxes=boxes, results=results))
-    return list(RecordingReader(path).frames())
+    steps = []
+    for place, results in enumerate([(LINES, PLAN), ()]):
+        frame = drive.load(place)
+        boxes = with_futures() if results else boxes_ahead()[:0]
+        steps.append((frame, replace(predict(frame), boxes=boxes, results=results)))
+    return recorded(tmp_path_factory.mktemp("lines") / "r.rrd", drive, steps, PLANNER)
 
 
 def strips(frame: RecordedFrame, entity: str, dimensions: int = 3) -> list[np.ndarray]:
@@ -119,3 +118,57 @@ def test_a_video_shows_the_lines_in_their_colours(frames: list[RecordedFrame]) -
         counts.append((np.abs(from_above - divider).max(-1) < 60).sum())
     assert counts[0] > 50
     assert counts[1] == 0
+
+
+def features(seed: int, rows: int = 6, columns: int = 5, channels: int = 12) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(rows, columns, channels)).astype(np.float32)
+
+
+@pytest.mark.parametrize("kind", ["norm", "pca", "channel:3"])
+def test_colours_are_fitted_on_two_frames_and_then_kept(kind):
+    images = BevImages(kind)
+    assert images.push(0, features(0)) == []  # the first frame's image is ready with the second
+    ready = images.push(1, features(1))
+    assert [stamp for stamp, _ in ready] == [0, 1]
+    images.push(2, 100 * features(2))  # would change any range that is not fixed
+    ((_, again),) = images.push(3, features(0))
+    np.testing.assert_array_equal(again, ready[0][1])
+
+
+def test_the_image_of_a_single_frame_is_ready_at_the_end():
+    images = BevImages("pca")
+    assert images.push("only", features(0)) == []
+    ((stamp, image),) = images.finish()
+    assert stamp == "only"
+    assert image.shape == (6, 5, 3)
+    assert images.finish() == []
+
+
+def test_the_row_with_the_largest_y_is_on_top():
+    cells = np.zeros((4, 3, 2), dtype=np.float32)
+    cells[3, 0] = 9  # row 3: the largest y; column 0: the smallest x
+    images = BevImages("norm")
+    images.push(0, cells)
+    ((_, image),) = images.finish()
+    brightest = np.unravel_index(image.sum(-1).argmax(), (4, 3))
+    assert brightest == (0, 0)
+
+
+def test_principal_components_are_those_of_the_singular_values():
+    images = BevImages("pca")
+    cells = np.zeros((20, 20, 3), dtype=np.float32)
+    cells[..., 1] = np.linspace(-9, 9, 20)[:, None]  # the largest spread
+    cells[..., 0] = np.linspace(-3, 3, 20)[None]
+    images.push(0, cells)
+    ((_, image),) = images.finish()
+    red, green = image[..., 0].astype(int), image[..., 1].astype(int)
+    assert (np.diff(red[:, 7]) <= 0).all()  # red is the largest component, along y; the largest y is on top
+    assert red[0, 7] - red[-1, 7] > 200
+    assert (np.diff(green[7]) >= 0).all()
+
+
+def test_a_missing_channel_is_an_input_error():
+    images = BevImages("channel:12")
+    images.push(0, features(0))
+    with pytest.raises(InputError, match="channels 0 to 11"):
+        images.push(1, features(1))

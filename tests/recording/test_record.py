@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from memory_drive import MemoryDrive
-from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
+from recorded_drive import boxes_ahead, predict, recorded, with_truth
 
 from bevcli.errors import InputError
 from bevcli.frame import BevMap, Drive, Frame
@@ -16,7 +16,6 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid
 from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
-from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
 from bevcli.workshop.formats.nuscenes_output import write_submission
@@ -81,12 +80,11 @@ def test_labels_alone_are_boxes_in_their_colours(tmp_path):
 
 def test_boxes_of_one_file_are_drawn_as_those_of_a_model(tmp_path):
     drive = Labelled(2)
-    with Recording(tmp_path / "model.rrd", drive, NamedModel(), RecordingOptions("minimal")) as recording:
-        for frame in map(drive.load, range(2)):
-            recording.log(frame, predict(frame))
+    steps = ((frame, predict(frame)) for frame in map(drive.load, range(2)))
+    of_model = recorded(tmp_path / "model.rrd", drive, steps, options=RecordingOptions("minimal"))
     write_boxes(boxes_file(drive, range(2)), tmp_path / "mine.json")
     record(drive, tmp_path / "mine.json", tmp_path / "file.rrd")
-    pairs = list(zip(frames_of(tmp_path / "model.rrd"), frames_of(tmp_path / "file.rrd"), strict=True))
+    pairs = list(zip(of_model, frames_of(tmp_path / "file.rrd"), strict=True))
     drawn = [entity for entity in pairs[0][0].rows if entity.endswith(("boxes", "labels", "truth", "missed", "false"))]
     assert len(drawn) > 20
     for of_model, of_file in pairs:

@@ -1,4 +1,4 @@
-"""What a recording holds, read back from the file."""
+"""What a recording holds, read back from the file; its rows equal those of rerun's archetypes."""
 
 import gc
 from dataclasses import replace
@@ -7,8 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rerun as rr
 from memory_drive import MemoryDrive, WithoutImages, make_rig
-from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, with_truth
+from recorded_drive import NamedModel, bev_from_world, boxes_ahead, predict, record, recorded, with_truth
 
 from bevcli.cli.run import _frame_warnings
 from bevcli.errors import OutputError
@@ -16,6 +17,7 @@ from bevcli.frame import BevMap, CameraImage, NewStart, StartReason
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Pose
 from bevcli.recording import RecordingOptions, entities
+from bevcli.recording.entities import any_values, components, line_strips, packed, rgb_format, ui_points
 from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 
@@ -120,9 +122,7 @@ def test_boxes_are_projected_at_the_time_of_each_image(tmp_path):
     own = CameraImage(image.timestamp_ns, image.pixels_bgr, jpeg, "image/jpeg")
     earlier = Pose(frame.world_from_ego.translation - [2.0, 0, 0], frame.world_from_ego.quaternion)
     frame = replace(frame, images={"CAM_FRONT": own}, world_from_ego_at={"CAM_FRONT": earlier})
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(frame, predict(frame))
-    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    (read,) = recorded(tmp_path / "r.rrd", drive, [(frame, predict(frame))])
     assert read.blob(entities.image("CAM_FRONT"), "EncodedImage:blob") == jpeg  # the bytes of a file are kept
     color = 0xFF9E2CFF  # the car's
     colors = np.array(read.values(entities.overlay("CAM_FRONT", "boxes"), "LineStrips2D:colors"))
@@ -209,8 +209,7 @@ def test_recording_and_command_line_tell_a_failed_frame_alike(tmp_path, changes)
     frame = drive.load(0)
     gap = NewStart(StartReason.GAP, 2.5)
     failed = replace(predict(frame), boxes=Boxes3D.empty(), bev=None, started_anew=gap, **changes)
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(frame, failed)
+    recorded(tmp_path / "r.rrd", drive, [(frame, failed)])
     assert sorted(events(tmp_path / "r.rrd")) == sorted(_frame_warnings(frame, failed, standing=None))
 
 
@@ -230,10 +229,8 @@ def test_a_frame_without_boxes_shows_none(tmp_path, monkeypatch):
     monkeypatch.setenv("RERUN_STRICT", "1")
     drive = MemoryDrive(2, ONE)
     first, second = (with_truth(drive.load(place)) for place in range(2))
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(first, predict(first))
-        recording.log(replace(second, ground_truth=Boxes3D.empty()), replace(predict(second), boxes=Boxes3D.empty()))
-    *_, last = RecordingReader(tmp_path / "r.rrd").frames()
+    nothing = replace(second, ground_truth=Boxes3D.empty()), replace(predict(second), boxes=Boxes3D.empty())
+    *_, last = recorded(tmp_path / "r.rrd", drive, [(first, predict(first)), nothing])
     assert len(recorded_boxes(last).boxes) == 0
     assert last.values(entities.GROUND_TRUTH, "name") == []
     for entity in (entities.BEV_BOXES, entities.overlay("CAM_FRONT", "boxes")):
@@ -254,3 +251,87 @@ def test_the_threads_of_earlier_recordings_end(tmp_path):
         counts.append(streams())
     # Those of the last recording and of its blueprint end when the next one begins, in a thread.
     assert counts[-1] - counts[0] <= 2
+
+
+RANDOM = np.random.default_rng(0)
+POINTS_2D, POINTS_3D = RANDOM.normal(size=(5, 2)), RANDOM.normal(size=(5, 3))
+STRIPS_2D, STRIPS_3D = RANDOM.normal(size=(5, 4, 2)), RANDOM.normal(size=(5, 4, 3))
+COLORS = RANDOM.integers(0, 256, (5, 3)).astype(np.uint8)
+WITH_OPACITY = RANDOM.integers(0, 256, (5, 4)).astype(np.uint8)
+IMAGE = RANDOM.integers(0, 256, (6, 4, 3)).astype(np.uint8)
+POSE = RANDOM.normal(size=(3, 3))
+BOXES = {"centers": POINTS_3D, "half_sizes": POINTS_3D, "quaternions": WITH_OPACITY / 255}
+BOXES |= {"fill_mode": "majorwireframe"}
+RADIUS = rr.Radius.ui_points(1.5)
+
+
+def rows(made):
+    return [(part.component_descriptor(), part.as_arrow_array()) for part in made]
+
+
+@pytest.mark.parametrize(
+    ("archetype", "fields", "expected"),
+    [
+        (
+            rr.LineStrips2D,
+            {"strips": STRIPS_2D, "colors": COLORS, "radii": ui_points(1.5), "draw_order": 30},
+            rr.LineStrips2D(STRIPS_2D, colors=COLORS, radii=RADIUS, draw_order=30),
+        ),
+        (
+            rr.LineStrips3D,
+            {"strips": STRIPS_3D, "colors": WITH_OPACITY, "radii": 0.06},
+            rr.LineStrips3D(STRIPS_3D, colors=WITH_OPACITY, radii=0.06),
+        ),
+        (rr.LineStrips2D, {"strips": STRIPS_2D[:0]}, rr.LineStrips2D([])),
+        (
+            rr.Points2D,
+            {"positions": POINTS_2D, "labels": ["ä", "", "car", "a", "b"], "colors": (1, 2, 3), "show_labels": True},
+            rr.Points2D(POINTS_2D, labels=["ä", "", "car", "a", "b"], colors=(1, 2, 3), show_labels=True),
+        ),
+        (rr.Points2D, {"positions": POINTS_2D, "colors": packed(COLORS)}, rr.Points2D(POINTS_2D, colors=COLORS)),
+        (rr.Boxes3D, BOXES | {"class_ids": np.arange(5)}, rr.Boxes3D(**BOXES, class_ids=range(5))),
+        (
+            rr.Arrows3D,
+            {"vectors": POINTS_3D, "origins": POINTS_3D, "colors": None},
+            rr.Arrows3D(vectors=POINTS_3D, origins=POINTS_3D),
+        ),
+        (rr.Transform3D, {"translation": POSE[0], "mat3x3": POSE.T}, rr.Transform3D(translation=POSE[0], mat3x3=POSE)),
+        (rr.Scalars, {"scalars": np.array([1, 2])}, rr.Scalars([1, 2])),
+        (
+            rr.Image,
+            {"buffer": IMAGE.reshape(-1), "format": rgb_format(4, 6), "draw_order": -5},
+            rr.Image(IMAGE, draw_order=-5),
+        ),
+        (
+            rr.EncodedImage,
+            {"blob": np.frombuffer(b"JPEG", np.uint8), "media_type": "image/jpeg"},
+            rr.EncodedImage(contents=b"JPEG", media_type="image/jpeg"),
+        ),
+    ],
+)
+def test_components_equal_those_of_the_archetype(archetype, fields, expected):
+    made = components(archetype, **fields)
+    of_rerun = dict(rows(expected.as_component_batches()))
+    assert made.keys() == of_rerun.keys()
+    for descriptor, array in of_rerun.items():
+        assert made[descriptor].type == array.type
+        assert made[descriptor].equals(array)
+
+
+def test_any_values_equal_those_of_rerun():
+    values = {"score": RANDOM.normal(size=3), "scene": "a", "timestamp_ns": 10**18}
+    expected = dict(rows(rr.AnyValues(**values).as_component_batches()))
+    for descriptor, array in any_values(**values).items():
+        assert array.type == expected[descriptor].type
+        assert array.equals(expected[descriptor])
+
+
+@pytest.mark.parametrize("lengths", [[], [2], [5, 2, 3, 1], [2, 2]])
+def test_strips_equal_those_of_rerun(lengths):
+    random = np.random.default_rng(0)
+    flat, solid = ([random.normal(size=(length, size)) for length in lengths] for size in (2, 3))
+    of_flat = line_strips(np.concatenate([np.zeros((0, 2)), *flat]), lengths)
+    of_solid = line_strips(np.concatenate([np.zeros((0, 3)), *solid]), lengths)
+    assert of_flat.equals(rr.components.LineStrip2DBatch(flat).as_arrow_array())
+    assert of_solid.equals(rr.components.LineStrip3DBatch(solid).as_arrow_array())
+    assert rr.LineStrips2D(of_flat).strips.as_arrow_array().equals(of_flat)

@@ -1,4 +1,4 @@
-"""Tracks in a recording: trails, labels, duplicates."""
+"""Tracks in a recording: trails, labels, duplicates; and true positives and misses as `bevcli eval` counts them."""
 
 from dataclasses import replace
 
@@ -6,13 +6,24 @@ import numpy as np
 import pytest
 import rerun as rr
 from memory_drive import MemoryDrive, make_rig
-from recorded_drive import NamedModel, boxes_ahead, predict, with_truth
+from recorded_drive import boxes_ahead, predict, recorded, with_truth
 
+from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.recording import entities
-from bevcli.recording.log_boxes import AHEAD_S, PAST_S, false_and_duplicate
+from bevcli.recording.entities import GROUND_TRUTH_COLOR, MISSED_COLOR, OTHER_COLOR
+from bevcli.recording.log_boxes import (
+    AHEAD_S,
+    PAST_S,
+    detectable,
+    false_and_duplicate,
+    ground_truth_colors,
+    other_classes,
+    true_positives,
+)
 from bevcli.recording.log_cameras import box_labels
-from bevcli.recording.writer import Recording
 from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
+from bevcli.workshop.scores.detection import DetectionConfig, evaluate_detections
 
 ONE = make_rig({"CAM_FRONT": 0.0})
 CAR, PEDESTRIAN = entities.track("car", "7"), entities.track("pedestrian", "8")
@@ -21,12 +32,10 @@ CAR, PEDESTRIAN = entities.track("car", "7"), entities.track("pedestrian", "8")
 def record_tracks(path, count: int, instances, scenes: str = "a" * 30):
     """A recording whose three boxes have these instances, by frame; returns its frames as read."""
     drive = MemoryDrive(count, ONE, scenes=scenes)
-    with Recording(path, drive, NamedModel()) as recording:
-        for place in range(count):
-            frame = drive.load(place)
-            boxes = replace(boxes_ahead(), instances=np.array(instances(place)))
-            recording.log(frame, replace(predict(frame), boxes=boxes))
-    return list(RecordingReader(path).frames())
+    boxes = [replace(boxes_ahead(), instances=np.array(instances(place))) for place in range(count)]
+    frames = [drive.load(place) for place in range(count)]
+    steps = [(frame, replace(predict(frame), boxes=each)) for frame, each in zip(frames, boxes, strict=True)]
+    return recorded(path, drive, steps)
 
 
 def strips(frame, entity: str) -> list[np.ndarray]:
@@ -74,9 +83,7 @@ def test_a_track_without_a_box_is_cleared(tmp_path):
 
 def test_a_recording_without_a_tracker_has_no_tracks(tmp_path):
     drive = MemoryDrive(1, ONE)
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(drive.load(0), predict(drive.load(0)))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    (frame,) = recorded(tmp_path / "r.rrd", drive, [(drive.load(0), predict(drive.load(0)))])
     assert entities.BEV_TRACKS not in frame.rows
     assert recorded_boxes(frame).boxes.instances is None
 
@@ -110,9 +117,7 @@ def test_duplicates_are_marked_in_both_views(tmp_path):
     drive = MemoryDrive(1, ONE)
     frame = with_truth(drive.load(0))
     twice = boxes_ahead()[[0, 0, 1]]
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(frame, replace(predict(frame), boxes=twice))
-    (read,) = RecordingReader(tmp_path / "r.rrd").frames()
+    (read,) = recorded(tmp_path / "r.rrd", drive, [(frame, replace(predict(frame), boxes=twice))])
     for entity, kind in ((entities.DUPLICATES, "LineStrips3D"), (entities.BEV_DUPLICATES, "LineStrips2D")):
         assert len(read.values(entity, f"{kind}:strips")) == 1
     assert len(read.values(entities.FALSE_BOXES, "LineStrips3D:strips")) == 2  # the pedestrian
@@ -127,3 +132,74 @@ def test_a_track_of_a_class_of_any_name_is_one_entity(tmp_path, capfd):
     assert chunk.entity_path.strip("/") == entities.track("PKW / Lorry", "3")
     assert chunk.entity_path.replace("\\/", "").count("/") == 3  # /world/tracks/ and one name
     assert capfd.readouterr().err == ""  # rerun warns of names that it changes
+
+
+def boxes(places, classes, scores=None) -> Boxes3D:
+    count = len(places)
+    centers = np.column_stack([np.array(places, dtype=float), np.zeros(count)])
+    score_array = None if scores is None else np.array(scores)
+    return Boxes3D(centers, np.ones((count, 3)), np.zeros(count), np.zeros((count, 2)), np.array(classes), score_array)
+
+
+def test_truth_outside_grid_or_without_points_is_undetectable():
+    truth = replace(boxes([(0, 0), (1, 1), (80, 0)], ["car"] * 3), num_points=np.array([5, 0, 5]))
+    assert detectable(truth, BevGrid(50, 50)).centers[:, 0].tolist() == [0]
+
+
+def evaluated(predicted, truth):
+    """As `true_positives`, from the matching of the evaluation at 2 m."""
+    scores = evaluate_detections([predicted], [truth], DetectionConfig().unlimited())
+    centers = {"truth": [], "predicted": []}
+    row = DetectionConfig().distances_m.index(2.0)
+    for part in scores.matches:
+        centers["predicted"] += part.predictions.boxes.centers[part.matched[row] >= 0].tolist()
+        centers["truth"] += part.ground_truth.boxes.centers[part.matched[row][part.matched[row] >= 0]].tolist()
+    return (
+        [center in centers["predicted"] for center in predicted.centers.tolist()],
+        [center in centers["truth"] for center in truth.centers.tolist()],
+    )
+
+
+@pytest.mark.parametrize(
+    ("truth", "predicted", "true", "found"),
+    [
+        (  # within two metres, and its class
+            boxes([(0, 0), (10, 0), (20, 0)], ["car", "car", "bus"]),
+            boxes([(0, 1.9), (10, 2.1), (20, 0)], ["car"] * 3, [0.9, 0.8, 0.7]),
+            [True, False, False], [True, False, False],
+        ),
+        (boxes([(0, 0)], ["car"]), boxes([(0.1, 0), (0.5, 0)], ["car"] * 2, [0.3, 0.9]), [False, True], [True]),
+        (  # at exactly two metres
+            boxes([(0, 0), (10, 0)], ["car"] * 2),
+            boxes([(0, 2.0), (10, np.nextafter(2.0, 0))], ["car"] * 2, [0.9, 0.8]),
+            [False, True], [False, True],
+        ),
+        # Of equal scores the later one, as in the devkit.
+        (boxes([(0, 0)], ["car"]), boxes([(0.1, 0), (0.5, 0)], ["car"] * 2, [0.7, 0.7]), [False, True], [True]),
+    ],
+)  # fmt: skip
+def test_boxes_are_found_as_the_evaluation_does(truth, predicted, true, found):
+    assert [part.tolist() for part in true_positives(predicted, truth)] == [true, found]
+    assert evaluated(predicted, truth) == (true, found)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_display_agrees_with_the_evaluation(seed):
+    rng = np.random.default_rng(seed)
+    names = np.array(["car", "bus", "pedestrian"])
+    places = [rng.integers(0, 8, (count, 2)) + rng.uniform(0, 1e-6, (count, 2)) for count in (25, 60)]
+    truth = boxes(places[0], rng.choice(names, 25))
+    predicted = boxes(places[1], rng.choice(names, 60), rng.integers(1, 5, 60) / 5)
+    true, found = true_positives(predicted, truth)
+    assert true.any()
+    assert not true.all()
+    assert evaluated(predicted, truth) == (true.tolist(), found.tolist())
+
+
+def test_ground_truth_of_other_classes_is_grey_and_never_missed():
+    truth = boxes([(0, 0), (5, 0), (9, 0)], ["car", "Tricycle", "bus"])
+    other = other_classes(truth, ("car", "bus"))
+    assert other.tolist() == [False, True, False]
+    assert not other_classes(truth, ("car", "bus", "Tricycle")).any()
+    colors = ground_truth_colors(np.array([True, True, False]), other)
+    assert colors.tolist() == [list(GROUND_TRUTH_COLOR), list(OTHER_COLOR), list(MISSED_COLOR)]

@@ -1,20 +1,31 @@
-"""The views: legend, colours of maps, range rings, size of the camera views, titles, speed, street map."""
+"""The views: legend, map colours, range rings, order and size of camera views, titles, speed, street map, box lines."""
 
 from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 import pytest
-from memory_drive import MemoryDrive, make_rig
-from recorded_drive import GRID, TINY, NamedModel, predict, record
+from made_boxes import made_boxes
+from memory_drive import MemoryDrive, make_camera, make_rig
+from recorded_drive import GRID, TINY, NamedModel, predict, record, recorded
 
 from bevcli.frame import MAP_CLASSES, MOST_MAP_CLASSES, BevMap, DriveFacts, class_bits
 from bevcli.geometry.bev_grid import BevGrid
+from bevcli.geometry.boxes import BOX_EDGES, Boxes3D
+from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, Distortion, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import GeoOrigin
 from bevcli.model.config import ModelConfig
 from bevcli.recording import RecordingOptions, entities
-from bevcli.recording.blueprint import frame_rate_hz
+from bevcli.recording.blueprint import (
+    TEXTS_SHARE,
+    TITLE_HEIGHT,
+    WINDOW,
+    camera_row_shares,
+    camera_rows,
+    frame_rate_hz,
+    rows_by_yaw,
+)
 from bevcli.recording.entities import (
     BACKGROUND,
     GROUND_TRUTH_COLOR,
@@ -23,6 +34,17 @@ from bevcli.recording.entities import (
     OTHER_MAP_COLORS,
     class_colors,
     map_colors,
+)
+from bevcli.recording.log_cameras import (
+    LETTER_HEIGHT,
+    LETTER_WIDTH,
+    NEAR_CLIP_M,
+    ImageLines,
+    PosedCamera,
+    clip_near,
+    clip_to_image,
+    labels_in_image,
+    lines_in_images,
 )
 from bevcli.recording.log_static import FROM_RENDERED, UNTRAINED, Recorded, legend_entries, ring_distances_m
 from bevcli.recording.writer import Recording
@@ -100,9 +122,7 @@ def test_titles_say_when_the_weights_do_not_know_such_images():
 
 def test_note_legend_and_speed_are_in_the_recording(tmp_path):
     drive = MadeDrive()
-    with Recording(tmp_path / "r.rrd", drive, Weights()) as recording:
-        recording.log(drive.load(0), predict(drive.load(0)))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    (frame,) = recorded(tmp_path / "r.rrd", drive, [(drive.load(0), predict(drive.load(0)))], Weights())
     assert frame.values(entities.RUN, "note") == [FROM_RENDERED]
     chunks = [c.to_record_batch() for c in RecordingReader(tmp_path / "r.rrd").chunks() if c.entity_path == "/events"]
     texts = [text for batch in chunks for (text,) in batch.column("TextLog:text").to_pylist()]
@@ -118,9 +138,8 @@ def test_the_segmentation_lies_on_the_ground(tmp_path):
     cells = np.zeros((20, 20), dtype=np.uint8)
     cells[0, 0] = MAP_CLASSES["vehicle"]  # the first row has the largest y
     maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m)
-    with Recording(tmp_path / "r.rrd", drive, NamedModel()) as recording:
-        recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    step = drive.load(0), replace(predict(drive.load(0)), segmentation=maps)
+    (frame,) = recorded(tmp_path / "r.rrd", drive, [step])
     assert entities.SPEED not in frame.rows  # without poses there is none
     texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
     assert tuple(texture[:3]) == MAP_COLORS["vehicle"]
@@ -162,9 +181,8 @@ def test_a_model_with_its_own_map_classes_is_drawn_with_a_legend(tmp_path):
     cells[0, :3] = [1, 1 + 2, 4]
     config = LaneConfig(**{part.name: getattr(TINY, part.name) for part in fields(TINY)})
     maps = BevMap(cells, GRID.x_range_m, GRID.y_range_m, class_bits(config.map_classes))
-    with Recording(tmp_path / "r.rrd", drive, NamedModel(config=config)) as recording:
-        recording.log(drive.load(0), replace(predict(drive.load(0)), segmentation=maps))
-    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    step = drive.load(0), replace(predict(drive.load(0)), segmentation=maps)
+    (frame,) = recorded(tmp_path / "r.rrd", drive, [step], NamedModel(config=config))
     texture = frame.blob(entities.SEGMENTATION_ON_GROUND, "Mesh3D:albedo_texture_buffer")
     drawn = [tuple(texture[3 * place : 3 * place + 3]) for place in range(4)]
     assert drawn == [MAP_COLORS["drivable_area"], MAP_COLORS["divider"], OTHER_MAP_COLORS[0], BACKGROUND]
@@ -193,3 +211,164 @@ def test_the_rate_of_the_time_panel_is_that_of_the_drive():
     assert frame_rate_hz(MemoryDrive(5, step_s=0.5).stamps) == pytest.approx(2)
     assert frame_rate_hz(MemoryDrive(5, step_s=1 / 12).stamps) == pytest.approx(12)
     assert frame_rate_hz(MemoryDrive(1).stamps) == 2
+
+
+def test_cameras_are_in_rows_by_yaw():
+    assert camera_rows(make_rig()) == (
+        ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT"),
+        ("CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT"),
+    )
+    assert camera_rows(make_rig({"only": 180})) == camera_rows(make_rig({"only": 10})) == (("only",),)
+    yaws = {"left": 90, "rear": 180, "ahead": 0, "right": -90, "rear_right": -150, "rear_left": 150}
+    rows = rows_by_yaw({name: np.radians(yaw) for name, yaw in yaws.items()})
+    assert rows == (("left", "ahead", "right"), ("rear_left", "rear", "rear_right"))
+
+
+FOUR = {"front": 0, "left": 90, "right": -90, "rear": 180}
+RIGS = {
+    "one": {"front": 0},
+    "two": {"front": 0, "rear": 180},
+    "three": {"left": 60, "right": -60, "rear": 180},
+    "four": FOUR,
+    "five": {"front": 0, "front_left": 55, "front_right": -55, "rear_left": 120, "rear_right": -120},
+    "six": NUSCENES_YAWS_DEG,
+    "seven": {**NUSCENES_YAWS_DEG, "tele": 1},
+    "eight": {**FOUR, "front_left": 45, "front_right": -45, "rear_left": 135, "rear_right": -135},
+}
+
+
+def image_sizes(rig):
+    """The width and height of each image in its view in the viewer's window, pixels."""
+    sizes = {}
+    for row, share in zip(camera_rows(rig), camera_row_shares(rig), strict=True):
+        view = WINDOW[0] * (1 - TEXTS_SHARE) / len(row), share * WINDOW[1] - TITLE_HEIGHT
+        for name in row:
+            scale = min(view[0] / rig[name].width, view[1] / rig[name].height)
+            sizes[name] = scale * rig[name].width, scale * rig[name].height
+    return sizes
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_all_images_of_a_rig_are_equally_large(rig):
+    sizes = np.array(list(image_sizes(make_rig(RIGS[rig])).values()))
+    assert sizes.min(axis=0) == pytest.approx(sizes.max(axis=0))
+    assert 0.1 < sum(camera_row_shares(make_rig(RIGS[rig]))) < 0.7  # the middle keeps room
+    assert sizes[0, 0] > 0.98 * min(WINDOW[0] * (1 - TEXTS_SHARE) / max(map(len, rows_by_yaw(RIGS[rig]))), 480)
+
+
+def test_a_single_rear_camera_does_not_squeeze_the_others():
+    sizes = image_sizes(make_rig(FOUR))
+    assert min(height for _, height in sizes.values()) > 0.25 * WINDOW[1]
+    assert sum(camera_row_shares(make_rig(FOUR))) < 0.63
+    narrow = make_camera("rear", 180, width=180, height=320)
+    rig = make_rig({"front": 0, "left": 60, "right": -60})
+    sizes = image_sizes(CameraRig((*rig.cameras, narrow), rig.ego_from_bev))
+    assert sizes["front"][1] > 0.2 * WINDOW[1]
+    assert 0.25 * WINDOW[1] < sizes["rear"][1] < 0.63 * WINDOW[1]
+
+
+def test_few_or_square_images_share_one_row():
+    assert camera_rows(make_rig(RIGS["two"])) == (("front", "rear"),)
+    assert camera_rows(make_rig(RIGS["three"])) == (("left", "right", "rear"),)
+    square = tuple(make_camera(name, yaw, width=320, height=320) for name, yaw in FOUR.items())
+    assert camera_rows(CameraRig(square, default_ego_from_bev())) == (("left", "front", "right", "rear"),)
+
+
+def test_labels_do_not_overlap_and_the_largest_box_wins():
+    boxes = np.array([[100, 100, 30], [110, 100, 90], [500, 100, 60], [600, 300, 2]])  # x, y, height
+    segments = np.array([[[x, y], [x + 5, y + h]] for x, y, h in boxes], dtype=float)
+    centers, owners = labels_in_image(ImageLines(segments, np.arange(4)), ["car 0.50"] * 4, 800, 450)
+    assert owners.tolist() == [1, 2]  # the first is covered by the second, the last is too small
+    size = np.array([8 * LETTER_WIDTH * 800, LETTER_HEIGHT * 450])
+    assert (np.abs(centers[0] - centers[1]) >= size - 1e-9).any()
+    assert (centers - size / 2)[:, 0].min() >= -1e-9
+
+
+def test_the_labels_of_the_legend_begin_at_their_colours(tmp_path):
+    """Letters are at most 0.3 units wide."""
+    record(tmp_path / "r.rrd", MemoryDrive(1))
+    (frame,) = RecordingReader(tmp_path / "r.rrd").frames()
+    colors, texts = (frame.array(f"{entities.LEGEND}/{kind}", "Points2D:positions", 2) for kind in ("colors", "texts"))
+    halves = np.array([len(text) for text in frame.texts(f"{entities.LEGEND}/texts", "Points2D:labels")]) * 0.15
+    starts = texts[:, 0] - halves - colors[:, 0]
+    assert len(starts) > 10
+    assert (starts > -0.1).all()
+    assert (starts < 1.0).all()
+
+
+FINE = 256  # cv2.clipLine takes integers: subdivide the pixels
+CAMERA = Camera("front", 640, 360, np.array([[400.0, 0, 320], [0, 400, 180], [0, 0, 1]]), np.eye(4))
+AT_ORIGIN = PosedCamera(CAMERA, np.eye(4), np.eye(4))
+
+
+def one_box(center, size=(2.0, 2.0, 2.0)) -> Boxes3D:
+    """In the camera frame: z is ahead."""
+    return made_boxes([center], sizes_lwh=size)
+
+
+def test_lines_are_clipped_as_by_opencv():
+    random = np.random.default_rng(1)
+    segments = random.integers(-400, 1000, (400, 2, 2)).astype(float)
+    clipped, kept = clip_to_image(segments, 640, 360)
+    for segment, ours, is_kept in zip(segments, clipped, kept, strict=True):
+        start, end = (segment * FINE).astype(int).tolist()
+        inside, start, end = cv2.clipLine((0, 0, 640 * FINE + 1, 360 * FINE + 1), start, end)
+        if not inside:
+            assert not is_kept or np.linalg.norm(ours[0] - ours[1]) < 0.1
+        elif np.linalg.norm(np.subtract(start, end)) > FINE / 10:
+            assert is_kept
+            np.testing.assert_allclose(ours, np.array([start, end]) / FINE, atol=0.1)
+
+
+def test_a_line_through_the_camera_is_cut_at_the_near_plane():
+    ends, before = clip_near(np.array([[[0.0, 0, -1], [0, 0, 3]], [[0, 0, -1], [0, 0, -2]]]))
+    assert before.tolist() == [True, False]
+    np.testing.assert_allclose(ends[0], [[0, 0, NEAR_CLIP_M], [0, 0, 3]])
+
+
+def test_a_box_around_the_camera_stays_inside_the_image():
+    lines = lines_in_images(one_box((2, 0, 0), (6, 6, 6)).corners(), [AT_ORIGIN])[0]
+    assert len(lines.segments)
+    assert lines.segments.min() >= -1e-9
+    assert (lines.segments <= [640 + 1e-9, 360 + 1e-9]).all()
+    assert not len(lines_in_images(one_box((0, 0, -10)).corners(), [AT_ORIGIN])[0].segments)  # behind the camera
+
+
+def test_a_box_ahead_is_where_the_pinhole_model_projects_it():
+    lines = lines_in_images(one_box((0, 0, 10)).corners(), [AT_ORIGIN])[0]
+    # Its nearest face is 9 m away and 2 m wide: 400 px/m at 1 m, 44.4 px at 9 m to each side.
+    np.testing.assert_allclose(lines.segments.reshape(-1, 2).max(0), [320 + 400 / 9, 180 + 400 / 9])
+    assert set(lines.owners) == {0}
+
+
+def test_every_box_of_which_an_edge_is_inside_the_image_is_drawn():
+    random = np.random.default_rng(0)
+    count = 400
+    sizes, yaws = random.uniform(0.5, 12, (count, 3)), random.uniform(-np.pi, np.pi, count)
+    boxes = Boxes3D(random.normal(size=(count, 3)) * 12, sizes, yaws, np.zeros((count, 2)), np.array(["car"] * count))
+    (lines,) = lines_in_images(boxes.corners(), [AT_ORIGIN])
+    shares = np.linspace(0, 1, 200)[:, None]
+    expected = set()
+    for index, corners in enumerate(boxes.corners()):
+        for start, end in BOX_EDGES:
+            x, y, z = (corners[start] + shares * (corners[end] - corners[start])).T
+            ahead = z > NEAR_CLIP_M
+            u, v = 320 + 400 * x[ahead] / z[ahead], 180 + 400 * y[ahead] / z[ahead]
+            if ((u > 0) & (u < 640) & (v > 0) & (v < 360)).any():
+                expected.add(index)
+    assert 50 < len(expected) < 350
+    assert expected <= set(lines.owners)
+
+
+def test_a_distorted_edge_is_curved():
+    lens = Distortion("brown_conrady", (-0.3, 0.05, 0.0, 0.0))
+    box = one_box((0, 2.2, 8), (7.0, 0.5, 0.5))
+    lines = lines_in_images(box.corners(), [replace(AT_ORIGIN, camera=replace(CAMERA, distortion=lens))])[0]
+    corners = box.corners()[0, :4]
+    middle = (corners[0] + corners[1]) / 2
+    numbers = CAMERA.intrinsics, np.array(lens.coefficients)
+    expected, _ = cv2.projectPoints(middle[None], np.zeros(3), np.zeros(3), *numbers)
+    away = np.linalg.norm(lines.segments.reshape(-1, 2) - expected.reshape(2), axis=-1).min()
+    straight = np.array([CAMERA.project(c)[0] for c in corners[:2]]).mean(0)
+    assert away < 1.5
+    assert np.linalg.norm(straight - expected.reshape(2)) > 3

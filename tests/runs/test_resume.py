@@ -113,11 +113,8 @@ def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
         if len(calls) in (2, 3):  # the second frame, and the search in it
             output[0][0] = float("nan")
 
-    hook = model.prepared.get_submodule("neck").register_forward_hook(spoil)
-    try:
+    with model.prepared.get_submodule("neck").register_forward_hook(spoil):
         interrupt(model, tmp_path / "out", 3)
-    finally:
-        hook.remove()
     failed = json.loads((tmp_path / "out/summary.json").read_text())["not_finite_frames"]
     assert [each["frame"] for each in failed] == [1]
     assert run_all(model, tmp_path / "out", resume=True).to_dict()["not_finite_frames"] == failed

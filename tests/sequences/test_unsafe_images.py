@@ -9,7 +9,6 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from command_line import invoked
 
 from bevcli.errors import InputError
 from bevcli.parsing.images import decode_image, size_of_image
@@ -137,12 +136,6 @@ def test_images_outside_of_the_folder_need_allow_outside(drive, kind):
         table = drive / "frames.csv"
         table.write_text(table.read_text().replace("../elsewhere.png", "images/../images/CAM_BACK/1.png"))
         assert "CAM_BACK" in open_sequence(drive).load(1).images
-
-
-def test_a_command_takes_allow_outside(drive, tmp_path):
-    outside(drive, "dots")
-    invoked("convert", drive, tmp_path / "out", "--allow-outside")
-    assert "CAM_BACK" in open_sequence(tmp_path / "out").load(1).images
 
 
 @pytest.mark.parametrize("name", ["../../evil", "a/b", "..", "", "a\\b", "x" * 300, "a\nb", "/etc"])

@@ -1,7 +1,8 @@
-"""A training looks at its drives before it writes anything: classes, ground truth, lengths and the split."""
+"""A training looks at its drives before it writes anything; a model file for a data set follows from its drives."""
 
 import json
 import shutil
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,18 +10,32 @@ from pathlib import Path
 import pytest
 import torch
 from command_line import MINI_TOML, command
+from memory_drive import MemoryDrive
+from recorded_drive import with_truth
 from small_fleet import write_fleet
 
-from bevcli.config import load_config
+from bevcli.config import TRAINING, as_toml, load_config, load_table
 from bevcli.errors import BevcliError, ConfigError, InputError
+from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.load import Model
 from bevcli.inference.runner import StepOptions
+from bevcli.model.config import BevFrameConfig
 from bevcli.model.temporal_model import build_model
 from bevcli.sequences.native.folder import FolderDrive
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import FolderDrives, read_split, scored_drives
 from bevcli.workshop.training import TrainOptions
 from bevcli.workshop.training.job import TrainingConfig, TrainingJob, prepare_training, with_changes
+from bevcli.workshop.training.model_file import (
+    NUSCENES_SIZES,
+    PRESETS,
+    Cost,
+    class_of_size,
+    fitting_batch,
+    look_at,
+    model_table,
+    write_model_file,
+)
 from bevcli.workshop.training.samples import ClipConfig
 from bevcli.workshop.training.trainer import Trainer
 from bevcli.workshop.training.validation import check_scored_drives, check_training_drives, run_drives
@@ -183,10 +198,15 @@ def test_changes_have_the_types_of_toml() -> None:
         ("learning_rte", "1", 'unknown key "learning_rte"; did you mean "optimizer.learning_rate"'),
         ("clips.batch", "two", "\"training.clips.batch\" must be an integer of 1 or more, but is 'two'"),
         ("clips", "2", 'unknown key "clips"; did you mean "clips'),
+<<<<<<< HEAD
         ("clips.batch", "0", '"training.clips.batch" must be an integer of 1 or more, but is 0'),
         ("optimizer.average", "1", 'average" must be a number from 0 to below 1, but is 1'),
         ("optimizer.learning_rate", "0", 'learning_rate" must be a number above 0, but is 0'),
         ("augmentation.randomisation.color", "1.5", 'color" must be a number from 0 to 1, but is 1.5'),
+=======
+        ("clips.batch", "0", r"\[training.clips\]: frames and batch must be positive"),
+        ("perspective_loss.depth_weight", "-1.0", r"\[training.perspective_loss\]: layers and the weights must not be"),
+>>>>>>> 198e0636 (Fold small test files into those they belong to, and drop tests whose facts another states)
         ("zzz", "0", "the keys are in the table of docs/training.md"),
     ],
 )
@@ -233,3 +253,88 @@ def test_missing_images_are_told(
     assert first.startswith("warning: d000, frame ")
     assert first.endswith("black in training; all of these are counted at the end")
     assert f"{len(images) - 1} images could not be read, and were black in training: d000, frame 0, " in last
+
+
+FRAME = BevFrameConfig()
+
+
+class TrueDrive(MemoryDrive):
+    """Frames with a car 12 m ahead and a bicycle at (5, 21) m, in the bev frame."""
+
+    def load(self, place):
+        return with_truth(super().load(place))
+
+
+def test_the_file_trains_as_it_is_and_states_facts_and_cost(fleet: Path) -> None:
+    path = fleet / "my model.toml"
+    data = DriveOptions(data=(fleet / "d000", fleet / "d001"), class_map={"bicycle": "Fahrrad"})
+    lines = write_model_file(path, data, "quick", CPU, longest_s=0.0)
+    config, training = load_config(path), load_table(path, TRAINING, TrainingConfig)
+    assert (config.name, config.classes, config.image.size) == ("my model", ("car", "Fahrrad"), (80, 45))
+    assert (config.bev_grid.y_range_m, config.rate_hz, config.heads) == ((-21, 21), 2.0, ("detection",))
+    assert (training.held_out, training.clips.frames, training.freeze_batch_norm) == (1, 3, True)
+    assert config.training_rigs.cameras == (6, 6)
+    comments = [line.removeprefix("# ") for line in path.read_text().splitlines() if line.startswith("# ")]
+    assert comments == lines
+    assert lines[1] == "Boxes in 6 frames: car 6, Fahrrad 6."
+    assert "Fahrrad like car" in lines[2]  # the drive's bicycles are as long as cars
+    assert config.object_classes["Fahrrad"].gate_m == NUSCENES_CLASSES["car"].gate_m
+    assert "s an update" in lines[-2]
+    assert "memory" in lines[-2]
+    with pytest.raises(BevcliError, match="exists already"):
+        write_model_file(path, data, "quick", CPU)
+
+
+def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
+    for step_s, rate_hz, frames in ((1.0, 1.0, 4), (0.1, 2.0, 1)):
+        facts = look_at([TrueDrive(4, step_s=step_s)], FRAME)
+        table = model_table("m", "quick", facts)
+        assert (table["rate_hz"], table["training"]["clips"]["frames"]) == (rate_hz, frames)
+    assert table["training"]["held_out"] == 0
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_gives_a_model_with_its_own_layers(preset: str, tmp_path: Path) -> None:
+    facts = look_at([TrueDrive(6)], FRAME)
+    (tmp_path / "m.toml").write_text(as_toml(model_table("m", preset, facts)))
+    config, base = load_config(tmp_path / "m.toml"), load_config(PRESETS[preset][0])
+    assert (config.encoder, config.decoder, config.backbone) == (base.encoder, base.decoder, base.backbone)
+    assert (config.bev_grid.rows, config.channels) == (base.bev_grid.rows, base.channels)
+
+
+def test_toml_keeps_texts_numbers_and_names_with_dots() -> None:
+    table = {"a": 'Zug "1" ü', "b": [1, 2.5], "c": True, "d.e": {"f": 1e-4, "g": {"h": ["x"]}}}
+    assert tomllib.loads(as_toml(table)) == table
+
+
+def test_drives_without_boxes_and_other_options_are_refused(fleet: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="memory: has no ground truth boxes"):
+        look_at([MemoryDrive(2)], FRAME)
+    for data, message in (
+        (DriveOptions(), r"give either `data` \(`--data[^`]*`\)"),
+        (DriveOptions(rendered=(1,)), "rendered drives are trained with demo"),
+    ):
+        with pytest.raises(InputError, match=message):
+            write_model_file(tmp_path / "new.toml", data, "quick", CPU)
+    drive = ("--data", fleet / "d000")
+    for arguments, message in (
+        (("--init", "a.toml", "--steps", "3"), "--init trains nothing"),
+        (("--preset", "tiny", "--model", "demo"), "--preset is for --init"),
+        (("--init", "a.json"), "expected a name that ends in .toml"),
+    ):
+        done = command(tmp_path, "train", *arguments, *drive)
+        assert (done.returncode, message in done.stderr, len(done.stderr.splitlines())) == (1, True, 1), done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_cost_of_a_step_the_batch_and_the_class_of_a_size() -> None:
+    config = TrainingConfig(steps=10, clips=ClipConfig(frames=4, learn="all", in_turn=2))
+    assert Cost(config, "cpu", 0.5, 2.0, 0).step_s == 4.0  # its updates
+    assert Cost(config, "cpu", 0.5, 6.0, 0).step_s == 12.0  # the reading of its batches
+    assert all(class_of_size(*size) == name for name, size in NUSCENES_SIZES.items())
+    assert [class_of_size(*size) for size in ((4.1, 1.8, 1.5), (0.6, 0.6, 1.6))] == ["car", "pedestrian"]
+    gigabytes = 10**9  # a batch fills the card, but never shrinks
+    assert fitting_batch(4, 7 * gigabytes, 20 * gigabytes, 32) == 8
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 32) == 32
+    assert fitting_batch(4, 7 * gigabytes, 200 * gigabytes, 3) == 4
+    assert fitting_batch(1, 7 * gigabytes, 8 * gigabytes, 32) == 1

@@ -1,7 +1,6 @@
 """The training as a whole: it converges, is reproducible, resumes after a kill and rejects invalid input."""
 
 import os
-import resource
 import shutil
 import signal
 from collections.abc import Callable
@@ -11,6 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
+from command_line import full_disk
 from matplotlib.figure import Figure
 from painted_drives import CONFIG, PaintedDrives
 from safetensors.torch import load_file
@@ -210,11 +210,10 @@ def test_a_kill_or_a_full_disk_leaves_the_checkpoint_before(tmp_path: Path, monk
     model = BEVFormer(CONFIG)
     optimizer = make_optimizer(model, model.backbone, OptimizerConfig())
     save_checkpoint(tmp_path / "checkpoint.pt", 7, model, optimizer)
-    before, limits = (tmp_path / "checkpoint.pt").read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    with pytest.raises(OutputError, match=r"/checkpoint\.pt: cannot be written \(is the disk full\?"):
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    message = r"/checkpoint\.pt: cannot be written \(is the disk full\?"
+    with full_disk(10_000), pytest.raises(OutputError, match=message):
         save_checkpoint(tmp_path / "checkpoint.pt", 8, model, optimizer)
-    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
     def die(contents: object, path: Path) -> None:
         path.write_bytes(b"half")
