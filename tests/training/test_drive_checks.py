@@ -198,15 +198,11 @@ def test_changes_have_the_types_of_toml() -> None:
         ("learning_rte", "1", 'unknown key "learning_rte"; did you mean "optimizer.learning_rate"'),
         ("clips.batch", "two", "\"training.clips.batch\" must be an integer of 1 or more, but is 'two'"),
         ("clips", "2", 'unknown key "clips"; did you mean "clips'),
-<<<<<<< HEAD
         ("clips.batch", "0", '"training.clips.batch" must be an integer of 1 or more, but is 0'),
         ("optimizer.average", "1", 'average" must be a number from 0 to below 1, but is 1'),
         ("optimizer.learning_rate", "0", 'learning_rate" must be a number above 0, but is 0'),
         ("augmentation.randomisation.color", "1.5", 'color" must be a number from 0 to 1, but is 1.5'),
-=======
-        ("clips.batch", "0", r"\[training.clips\]: frames and batch must be positive"),
-        ("perspective_loss.depth_weight", "-1.0", r"\[training.perspective_loss\]: layers and the weights must not be"),
->>>>>>> 198e0636 (Fold small test files into those they belong to, and drop tests whose facts another states)
+        ("perspective_loss.depth_weight", "-1", 'depth_weight" must be a number of 0 or more, but is -1'),
         ("zzz", "0", "the keys are in the table of docs/training.md"),
     ],
 )
