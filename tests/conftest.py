@@ -10,14 +10,14 @@ import pytest
 GROUPS = {
     "processes": (
         *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
-        *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
+        *("test_extend", "test_fuzz", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     ),
     "rendered": ("test_drive", "test_export", "test_random_rig", "test_material", "test_body", "test_catalog"),
     "weights": ("test_checkpoints", "test_ego_motion_inputs", "test_system_errors", "test_fetch"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.
-FIRST = ("processes", "rendered", "test_resume", "test_fuzz", "test_equals_original", "test_run_batch")
+FIRST = ("processes", "rendered", "test_resume", "test_equals_original", "test_run_batch")
 
 
 def pytest_configure(config: pytest.Config) -> None:

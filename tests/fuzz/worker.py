@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
+import multiprocessing.process
 import os
 import resource
 import shutil
-import sys
 import tempfile
 import traceback
 import warnings
@@ -17,6 +16,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING
+
+from forks import FORKS
 
 if TYPE_CHECKING:
     from readers import Reader
@@ -66,12 +67,10 @@ class Worker:
             shutil.rmtree(self._folder, ignore_errors=True)  # what it started may live a little longer
 
     def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, other = context.Pipe()
-        os.environ.setdefault("MALLOC_ARENA_MAX", "2")
+        self._connection, other = FORKS.Pipe()
         self._folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir=self._seeds.parent))
-        given = other, self._seeds, self._folder, self._group, sys.path
-        self._process = context.Process(target=_serve, args=given, daemon=True)
+        given = other, self._seeds, self._folder, self._group
+        self._process = FORKS.Process(target=_serve, args=given, daemon=True)
         self._process.start()
         other.close()
         if not self._connection.poll(START_SECONDS):
@@ -80,8 +79,7 @@ class Worker:
         assert answer == "ready", answer
 
 
-def _serve(connection: Connection, seeds: Path, folder: Path, group: str | None, path: list[str]) -> None:
-    sys.path[:] = path
+def _serve(connection: Connection, seeds: Path, folder: Path, group: str | None) -> None:
     from readers import READERS
     from warm_python import WarmPython
 
