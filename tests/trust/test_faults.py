@@ -27,7 +27,7 @@ from bevcli.workshop.trust.faults import (
 
 RIG: CameraRig = nuscenes_like_rig(512, 288)
 SECOND = 1_000_000_000
-COUNT = 30  # points of a camera in a step
+COUNT = 20  # points of a camera in a step
 # A vehicle that turns and accelerates: seven poses, two a second.
 TIMES = np.arange(7) * SECOND // 2
 YAWS = np.array([0, 0.05, 0.14, 0.3, 0.4, 0.45, 0.47])
@@ -119,13 +119,12 @@ def test_mirrored_poses_are_one_finding():
     assert [each.code for each in findings(*SOUND, rows=rows)] == ["motion-axes"]
 
 
-@pytest.mark.parametrize(("axis", "words"), [(1, "2.0° further left"), (0, "2.0° further down")])
-def test_a_wrong_rotation_is_named_with_its_angle(axis: int, words: str):
-    turn = Rotation.from_rotvec(np.radians(2) * np.eye(3)[axis]).as_matrix()  # the stated camera looks right, or up
+def test_a_wrong_rotation_is_named_with_its_angle():
+    turn = Rotation.from_rotvec(np.radians([2, 1.5, 0])).as_matrix()  # the stated camera looks up and right
     camera = replace(FRONT, ego_from_camera=FRONT.ego_from_camera @ rigid(rotation=turn))
     (finding,) = findings(stated(seen(FRONT), camera), *SOUND)
     assert finding.code == "calibration-off"
-    assert words in finding.message
+    assert "1.5° further left and 2.0° further down" in finding.message
 
 
 def grey(count: int = 4) -> list[dict[str, np.ndarray]]:
