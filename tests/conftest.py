@@ -9,15 +9,15 @@ import pytest
 # drive, syntax trees, and the shapes of the weights of all known models.
 GROUPS = {
     "processes": (
-        *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window"),
-        *("test_extend", "test_fuzz", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
+        *("test_engines", "test_in_engine", "test_export_onnx", "test_export_window", "test_fuzz"),
+        *("test_extend", "test_interrupted_run", "test_no_answer", "test_no_connections", "test_process_group"),
     ),
     "rendered": ("test_drive", "test_export", "test_random_rig", "test_material", "test_body", "test_catalog"),
     "weights": ("test_checkpoints", "test_ego_motion_inputs", "test_system_errors", "test_fetch"),
 }
 TOGETHER = {file: group for group, files in GROUPS.items() for file in files}
 # What takes longest comes first, so that no worker ends with it.
-FIRST = ("processes", "rendered", "test_resume", "test_equals_original", "test_run_batch")
+FIRST = ("processes", "rendered", "test_resume", "test_equals_original", "test_run_batch", "test_faults")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,6 +37,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # the modules stay: the garbage collector need not visit their million objects again and again
+    gc.set_threshold(10_000)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,5 +1,7 @@
 """A small exported model and its copy in INT8, which the tests of engines share."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ from bevcli.config import as_table
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.workshop.engines.export_form import pixels_of
 from bevcli.workshop.engines.export_onnx import export_onnx, quantize
+from bevcli.workshop.engines.exported import ExportedModel, load_exported
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +29,9 @@ def int8_file(small_file) -> Path:
     images = [pixels_of(small_inputs(seed).images, config.image).movedim(2, -1).numpy() for seed in range(4)]
     quantize(small_file, images, file)
     return file
+
+
+@pytest.fixture(scope="session")
+def loaded() -> Callable[[Path, str], ExportedModel]:
+    """`load_exported`, which keeps what it has loaded."""
+    return cache(load_exported)

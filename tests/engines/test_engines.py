@@ -43,8 +43,8 @@ STREET = Path(__file__).parents[2] / "samples" / "street"
 
 
 @pytest.mark.parametrize("engine", list(entries("bevcli.engines")))
-def test_an_engine_equals_the_model_with_and_without_history(small_file, engine):
-    check_file(load_exported(small_file, engine), model_for_engines())
+def test_an_engine_equals_the_model_with_and_without_history(small_file, loaded, engine):
+    check_file(loaded(small_file, engine), model_for_engines())
 
 
 @pytest.mark.slow
@@ -67,9 +67,9 @@ def test_a_file_tells_its_model_and_that_its_weights_are_random(small_file):
 
 
 @pytest.mark.parametrize("in_a_run", [True, False])
-def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeypatch):
+def test_a_file_gets_the_pixels_of_images_that_fit(small_file, loaded, in_a_run, monkeypatch):
     """To the bit in a run, up to rounding where the frame was prepared for the model; a missing one is the mean."""
-    exported = load_exported(small_file, "onnxruntime")
+    exported = loaded(small_file, "onnxruntime")
     width, height = exported.config.image.size
     camera = make_camera("FRONT", 0, width, height)
     drive = MemoryDrive(1, CameraRig((camera, replace(camera, name="BACK")), default_ego_from_bev()))
@@ -86,9 +86,9 @@ def test_a_file_gets_the_pixels_of_images_that_fit(small_file, in_a_run, monkeyp
 
 
 @pytest.mark.parametrize("engine", ["onnxruntime", pytest.param("openvino", marks=pytest.mark.slow)])
-def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, engine):
+def test_int8_is_close_and_only_image_features_are_rounded(small_file, int8_file, loaded, engine):
     assert load_model(int8_file).precision == "int8"
-    exact, rounded = (load_exported(file, engine) for file in (small_file, int8_file))
+    exact, rounded = (loaded(file, engine) for file in (small_file, int8_file))
     with torch.inference_mode():
         expected, found = (step_of_file(file, small_inputs()).bev for file in (exact, rounded))
     difference = (found - expected).norm() / expected.norm()
@@ -116,15 +116,14 @@ def test_efficientnet_lite_runs_in_an_engine_and_in_int8(tmp_path):
     assert 1e-5 < (close - expected).norm() / expected.norm() < 0.15  # of random weights
 
 
-def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, int8_file, tmp_path):
+def test_more_cameras_on_a_cell_than_slots_are_an_error(small_file, loaded, tmp_path):
     model = model_for_engines()
     inputs = small_inputs()
     inputs.image_from_bev[:, 1] = inputs.image_from_bev[:, 0]  # both cameras look the same way
     with torch.inference_mode():
         expected = model(inputs).bev
-        torch.testing.assert_close(
-            step_of_file(load_exported(small_file, "onnxruntime"), inputs).bev, expected, rtol=1e-4, atol=1e-4
-        )
+        found = step_of_file(loaded(small_file, "onnxruntime"), inputs).bev
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     one = tmp_path / "one.onnx"
     proto = onnx.load(small_file)
     for entry in proto.metadata_props:

@@ -79,14 +79,15 @@ def test_a_deformable_convolution_is_an_operator_of_a_file(tmp_path):
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_a_file_equals_the_model_with_and_without_history(model_and_file):
+@pytest.mark.slow  # with other convolutions; test_engines.py compares the first file
+def test_a_file_equals_the_model_with_and_without_history(model_and_file, loaded):
     model, file = model_and_file
-    check_file(load_exported(file, "onnxruntime"), model)
+    check_file(loaded(file, "onnxruntime"), model)
 
 
-def test_a_camera_without_an_image_sees_nothing(model_and_file):
+def test_a_camera_without_an_image_sees_nothing(model_and_file, loaded):
     model, file = model_and_file
-    exported = load_exported(file, "onnxruntime")
+    exported = loaded(file, "onnxruntime")
     inputs = small_inputs()
     inputs.has_image[:] = False
     with torch.inference_mode():
@@ -115,12 +116,12 @@ def test_a_file_for_wide_cameras_is_larger_and_embeds_the_rig(tmp_path):
     assert read_metadata(metadata, tmp_path).config.image == small_config().image  # of one size for every rig
 
 
-def test_decoded_boxes_equal_the_decoder_of_the_library(model_and_file):
+def test_decoded_boxes_equal_the_decoder_of_the_library(model_and_file, loaded):
     model, file = model_and_file
-    exported = load_exported(file, "onnxruntime")
+    exported = loaded(file, "onnxruntime")
     found: dict[str, np.ndarray] = {}
-    exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
-    with torch.inference_mode():
+    hook = exported.engine.register_forward_hook(lambda module, arguments, outputs: found.update(outputs))
+    with hook, torch.inference_mode():
         expected = step_of_file(exported, small_inputs()).boxes(model.config)
     boxes, scores, classes = (found[name] for name in ("boxes", "scores", "classes"))
     np.testing.assert_allclose(scores[0], expected.scores, atol=1e-6)
