@@ -29,6 +29,11 @@ CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os
 two_workers = pytest.mark.skipif(CORES < 2, reason="this process may use one core only, and two workers need two")
 
 
+@pytest.fixture(autouse=True)
+def model_file(tmp_path):
+    (tmp_path / "mini.toml").write_text(MINI_TOML)
+
+
 def family_of(pid: int) -> dict[int, str]:
     """A process and all processes below it, with their command lines."""
     table = subprocess.run(["ps", "-e", "-o", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
@@ -70,7 +75,6 @@ def landed(out: Path) -> dict[Path, int]:
 @two_workers
 @pytest.mark.timeout(1800)
 def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     for seed in range(6):  # six rendered drives of 66 frames, cut into 198
         long = tmp_path / f"rendered/{seed}"
         render(long, seed=seed, frames=66, resolution=(80, 45))
@@ -124,7 +128,6 @@ def test_200_drives_with_a_killed_worker_and_a_killed_batch(tmp_path):
 
 @two_workers
 def test_ctrl_c_ends_a_batch_and_counts_no_attempt(tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 40, frames=4)
     process = start(tmp_path, *BATCH, "--workers", "2")
     wait_for_results(process, tmp_path / "out", 1)
@@ -139,7 +142,6 @@ def test_ctrl_c_ends_a_batch_and_counts_no_attempt(tmp_path):
 
 @two_workers
 def test_a_drive_that_kills_its_worker_each_time_is_given_up(tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 4, frames=2)
     # What a worker imports at its start: a drive of this name ends the process without any exception.
     (tmp_path / "sitecustomize.py").write_text(
@@ -164,7 +166,6 @@ def test_a_drive_that_kills_its_worker_each_time_is_given_up(tmp_path):
 
 
 def test_a_worker_that_cannot_start_ends_the_batch_with_one_line(tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 2, frames=1)
     done = command(tmp_path, *BATCH, "--workers", "2", "--gpus-per-worker", "1")
     assert done.returncode == 1
@@ -203,7 +204,6 @@ def s3(tmp_path, monkeypatch):
 @two_workers
 @pytest.mark.timeout(1200)
 def test_drives_and_results_in_s3(s3, tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 3, frames=2, truth=True)
     s3.put(str(tmp_path / "drives") + "/", "fleet/drives/", recursive=True)
     arguments = ("batch", "s3://fleet/drives/*", "--out", "s3://fleet/out", *BATCH[4:], "--eval", "--workers", "2")
@@ -222,7 +222,6 @@ def test_drives_and_results_in_s3(s3, tmp_path):
 
 
 def test_a_batch_runs_on_a_cluster_that_is_up_already(tmp_path, monkeypatch):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 4, frames=2)
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # workers get it from the batch
@@ -265,7 +264,6 @@ def free_port() -> int:
 
 @two_workers
 def test_a_local_batch_listens_on_this_machine_only(tmp_path):
-    (tmp_path / "mini.toml").write_text(MINI_TOML)
     write_fleet(tmp_path / "drives", 6, frames=2)
     process = start(tmp_path, *BATCH, "--workers", "2")
     wait_for_results(process, tmp_path / "out", 1)

@@ -1,18 +1,22 @@
-"""The whole model: shapes, invariants, gradients, its only state; and a prepared model equals the model itself."""
+"""The whole model: shapes, invariants, gradients, its only state; a prepared model equals it, also tiny on frames."""
 
 import copy
 from dataclasses import replace
 
+import numpy as np
+import original_reference as original
 import pytest
 import torch
 from small_model import small_inputs, small_model
 from torch import nn
 
+from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.attention import AttentionProbe
 from bevcli.model import prepare
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.image_tokens import ImageTokens, ImageTokensConfig
 from bevcli.model.kernels.choose import change_classes, fold_batch_norms
+from bevcli.model.kernels.onednn import has_matrix_unit
 from bevcli.model.prepare import TokensInBlocks, prepare_for_inference
 from bevcli.model.step import ModelInputs, ModelOutputs
 from bevcli.workshop.benchmark.versions import textbook_version
@@ -179,3 +183,56 @@ def test_a_gpu_equals_the_cpu(model, precision, tolerance):
         found = prepared(small_inputs(1).to(gpu), prepared(small_inputs(0).to(gpu)).bev).bev.cpu()
     expected = two_steps(model).bev
     assert (found - expected).norm() < tolerance * expected.norm()
+
+
+@pytest.fixture(scope="module")
+def rule_tiny() -> BEVFormer:
+    return original.rule_model("tiny", "both")
+
+
+@pytest.fixture(scope="module")
+def prepared_fp32(rule_tiny: BEVFormer) -> list[ModelOutputs]:
+    return four_frames(prepare_for_inference(rule_tiny, CPU))
+
+
+def four_frames(model: BEVFormer) -> list[ModelOutputs]:
+    """The outputs of all frames; 0 to 2 are one scene, 3 is another."""
+    outputs: list[ModelOutputs] = []
+    with torch.inference_mode():
+        for frame in range(4):
+            history = outputs[-1].bev if frame in (1, 2) else None
+            outputs.append(model(original.inputs(frame, model.config), history))
+    return outputs
+
+
+def nearest(boxes: Boxes3D, others: Boxes3D) -> np.ndarray:
+    """For each box the distance to the nearest other box of its class, metres."""
+    distance = np.linalg.norm(boxes.centers[:, None] - others.centers[None], axis=-1)
+    return np.where(boxes.classes[:, None] == others.classes[None], distance, np.inf).min(axis=1)
+
+
+@pytest.mark.slow
+def test_float32_equals_the_model(rule_tiny, prepared_fp32):
+    for expected, found in zip(four_frames(rule_tiny), prepared_fp32, strict=True):
+        distance = (found.box_codes - expected.box_codes)[-1, 0][:, [0, 1, 4]].norm(dim=-1)
+        assert distance.max() < 1e-2
+        assert (found.class_logits.sigmoid() - expected.class_logits.sigmoid()).abs().max() < 1e-4
+
+
+@pytest.mark.slow
+def test_most_boxes_in_bfloat16_are_within_a_tenth_metre(rule_tiny, prepared_fp32, monkeypatch):
+    monkeypatch.setattr(prepare, "has_matrix_unit", lambda: False)
+    assert share_within_a_tenth_metre(rule_tiny, prepared_fp32) >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not has_matrix_unit(), reason="this CPU has no unit for products of bfloat16")
+def test_rounded_products_move_a_quarter_of_the_boxes(rule_tiny, prepared_fp32):
+    assert share_within_a_tenth_metre(rule_tiny, prepared_fp32) >= 0.7  # docs/speed.md states it
+
+
+def share_within_a_tenth_metre(model: BEVFormer, prepared_fp32: list[ModelOutputs]) -> float:
+    half = four_frames(prepare_for_inference(model, CPU, "bf16"))
+    pairs = zip(prepared_fp32, half, strict=True)
+    distances = [nearest(one.boxes(model.config), other.boxes(model.config)) for one, other in pairs]
+    return float((np.concatenate(distances) < 0.1).mean())

@@ -14,7 +14,7 @@ from memory_drive import MemoryDrive
 from recorded_drive import NamedModel, predict, record, screenshot_or_skip
 
 from bevcli.errors import InputError, OutputError
-from bevcli.recording import RecordingOptions, has_av
+from bevcli.recording import RecordingOptions
 from bevcli.recording.writer import Recording
 from bevcli.viewer import rerun_viewer
 from bevcli.viewer.recording_reader import RecordingReader
@@ -51,8 +51,7 @@ def test_the_viewer_shows_every_view(screenshot):
 
 @pytest.mark.slow
 def test_a_screenshot_can_be_a_jpeg_of_a_video_recording(screenshot):
-    if not has_av():
-        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    pytest.importorskip("av")
     *_, folder = screenshot
     record(folder / "av1.rrd", MemoryDrive(3), RecordingOptions(images="av1"))
     take_screenshot(folder / "av1.rrd", folder / "image.jpg", 2)

@@ -81,8 +81,8 @@ def test_the_boxes_file_has_the_shown_boxes(drive, tmp_path):
 )
 @pytest.mark.slow
 def test_the_video_has_every_frame_and_the_boxes(drive, tmp_path, monkeypatch, ending, with_av, codecs):
-    if with_av and not video.has_av():
-        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    if with_av:
+        pytest.importorskip("av")
     monkeypatch.setattr(video, "has_av", lambda: with_av)
     _, path = drive
     odd = Path(shutil.copytree(path.parent, tmp_path / "\udcff"), path.name)  # not UTF-8: OpenCV and rerun fail at it
@@ -115,8 +115,7 @@ def test_a_video_that_does_not_fit_is_an_error(drive, tmp_path, ending):
 
 @pytest.mark.slow
 def test_a_video_of_av1_images_shows_them(tmp_path):
-    if not video.has_av():
-        pytest.skip("PyAV is not installed: pip install 'bevcli[video]'")
+    pytest.importorskip("av")
     for images in ("jpeg", "av1"):
         record(tmp_path / f"{images}.rrd", MemoryDrive(2), RecordingOptions(images=images))
         viz(tmp_path / f"{images}.rrd", "--video", tmp_path / f"{images}.mp4")
