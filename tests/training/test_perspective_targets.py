@@ -33,7 +33,7 @@ from bevcli.workshop.training.frame_losses import (
 )
 from bevcli.workshop.training.job import TrainingConfig
 from bevcli.workshop.training.samples import Batch, Clip
-from bevcli.workshop.training.targets import DetectionTargets, detection_targets, padded, segmentation_targets
+from bevcli.workshop.training.targets import PaddedTargets, detection_targets, of_all, segmentation_targets
 
 SIZE = (224, 384)  # height, width
 SHAPES = [(28, 48), (14, 24), (7, 12)]  # strides 8, 16, 32
@@ -52,10 +52,15 @@ class ImageTargets:
     ignored: torch.Tensor
 
 
+def of_frame(targets: PaddedTargets, index: int) -> PaddedTargets:
+    """The boxes of one frame of several."""
+    return PaddedTargets(*(column[index : index + 1] for column in vars(targets).values()))
+
+
 def targets_of_image(
-    image_from_bev: torch.Tensor, truth: DetectionTargets, locations: FeatureLocations, size: tuple[int, int]
+    image_from_bev: torch.Tensor, truth: PaddedTargets, locations: FeatureLocations, size: tuple[int, int]
 ) -> ImageTargets:
-    found = perspective_targets(image_from_bev[None], padded([truth]), locations, size)
+    found = perspective_targets(image_from_bev[None], truth, locations, size)
     positive = found.positive[0]
     return ImageTargets(positive.nonzero()[:, 0], found.labels[0, positive], found.boxes[0, positive], found.ignored[0])
 
@@ -77,9 +82,9 @@ def boxes(*rows: tuple[float, ...]) -> Boxes3D:
     return made_boxes(table[:, :3], sizes_lwh=table[:, 3:6], yaws=table[:, 6])
 
 
-def truth(*rows: tuple[float, ...]) -> DetectionTargets:
+def truth(*rows: tuple[float, ...]) -> PaddedTargets:
     codes = torch.from_numpy(encode(boxes(*rows))).float()
-    return DetectionTargets(torch.arange(len(codes)), codes)
+    return PaddedTargets.of_frame(torch.arange(len(codes)), codes)
 
 
 def targets(*rows: tuple[float, ...], shapes: list[tuple[int, int]] = SHAPES) -> ImageTargets:
@@ -110,7 +115,7 @@ def test_centers_depths_and_outlines_equal_opencv() -> None:
     )  # fmt: skip
     camera_from_bev = tilted_camera()
     intrinsics = INTRINSICS * [[1.2], [0.9], [1]]  # fx is not fy
-    objects = objects_of_image(image_from_bev(camera_from_bev, intrinsics), truth(*rows).codes, SIZE)
+    objects = objects_of_image(image_from_bev(camera_from_bev, intrinsics), truth(*rows).codes[0], SIZE)
 
     def project(points: np.ndarray) -> np.ndarray:
         rotation = cv2.Rodrigues(camera_from_bev[:3, :3])[0]
@@ -217,7 +222,9 @@ def test_a_box_partly_behind_has_the_outline_of_its_front_part() -> None:
     """A box from 4 m behind to 8 m ahead looks like the box from the cutting plane to 8 m ahead."""
     start, end = OUTLINE_DEPTH_M, 8.0
     whole, part = (1, 2, 1.0, 12, 1, 1, math.pi / 2), (1, (start + end) / 2, 1.0, end - start, 1, 1, math.pi / 2)
-    of_whole, of_part = (objects_of_image(image_from_bev(), truth(row).codes, SIZE).outlines for row in (whole, part))
+    of_whole, of_part = (
+        objects_of_image(image_from_bev(), truth(row).codes[0], SIZE).outlines for row in (whole, part)
+    )
     torch.testing.assert_close(of_whole, of_part, atol=0.5, rtol=0)
 
 
@@ -226,7 +233,7 @@ def test_the_rotation_is_relative_to_the_viewing_ray() -> None:
     azimuths = np.radians([60, 90, 120])
     camera = np.linalg.inv(tilted_camera())[:3, 3]
     rows = [(camera[0] + 12 * math.cos(a), camera[1] + 12 * math.sin(a), 1, 4, 2, 1.6, a + 0.3) for a in azimuths]
-    rotations = objects_of_image(image_from_bev(tilted_camera()), truth(*rows).codes, SIZE).rotations
+    rotations = objects_of_image(image_from_bev(tilted_camera()), truth(*rows).codes[0], SIZE).rotations
     expected = torch.tensor([[math.sin(0.3), math.cos(0.3)]]).expand(3, 2)
     torch.testing.assert_close(rotations, expected, atol=1e-4, rtol=0)
 
@@ -257,20 +264,20 @@ def test_boxes_out_of_range_class_or_points_are_no_targets(mini_config) -> None:
     rows = [("pedestrian", 1, 2, 0), ("car", 30, 0, 0), ("bus", 0, 0, 0), ("car", 5, 5, 0), ("car", 6, 5, 0)]
     truth = classed_boxes(*rows, num_points=[3, 9, 9, -1, 0])
     targets = detection_targets(truth, config)
-    assert targets.labels.tolist() == [1, 0]
-    assert targets.codes[:, :2].tolist() == [[1, 2], [5, 5]]
+    assert targets.labels.tolist() == [[1, 0]]
+    assert targets.codes[0, :, :2].tolist() == [[1, 2], [5, 5]]
 
 
 def test_a_vehicle_covers_the_cells_under_it() -> None:
     along_y = classed_boxes(("car", 1.0, 0.0, np.pi / 2), ("pedestrian", -5.0, 1.0, 0.0))
     targets = segmentation_targets(along_y, None, GRID)
-    assert targets.stuff is None
+    assert targets.has_stuff.tolist() == [[False]]
     expected = torch.zeros(1, 4, 8)
     expected[0, 1:3, 4] = 1  # x 0 to 2, y -2 to 2
-    assert torch.equal(targets.things, expected.flatten(1))
-    assert targets.locations.tolist() == [pytest.approx([9 / 16, 0.5, 2 / 16, 4 / 8])]
+    assert torch.equal(targets.things[0], expected.flatten(1))
+    assert targets.locations[0].tolist() == [pytest.approx([9 / 16, 0.5, 2 / 16, 4 / 8])]
     small = replace(classed_boxes(("bicycle", 0.2, 0.2, 0.3)), sizes_lwh=np.array([[0.5, 0.3, 1.0]]))
-    assert segmentation_targets(small, None, GRID).things.nonzero().tolist() == [[0, 2 * 8 + 4]]
+    assert segmentation_targets(small, None, GRID).things[0].nonzero().tolist() == [[0, 2 * 8 + 4]]
 
 
 def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
@@ -279,8 +286,7 @@ def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
     cells[2, :2] = 4  # a crossing on half of the cell at the smallest x, y 0 to 2
     cells[4, :1] = 4  # a crossing on a quarter of the cell below: too little
     cells[7, 15] = 2  # a lane boundary on a quarter of the cell at the largest x, smallest y; enough for lines
-    stuff = segmentation_targets(Boxes3D.empty(), BevMap(cells, (-8, 8), (-4, 4)), GRID).stuff
-    assert stuff is not None
+    stuff = segmentation_targets(Boxes3D.empty(), BevMap(cells, (-8, 8), (-4, 4)), GRID).stuff[0]
     road, line, crossing = stuff.reshape(3, 4, 8)
     assert road[3].all()
     assert not road[:3].any()
@@ -291,8 +297,7 @@ def test_a_class_needs_a_minimum_share_of_a_cell() -> None:
 def test_the_bits_of_a_map_are_those_that_it_states() -> None:
     cells = np.full((8, 16), 2, dtype=np.uint8)
     crossings = BevMap(cells, (-8, 8), (-4, 4), {"kerb": 1, "pedestrian_crossing": 2})
-    stuff = segmentation_targets(Boxes3D.empty(), crossings, GRID).stuff
-    assert stuff is not None
+    stuff = segmentation_targets(Boxes3D.empty(), crossings, GRID).stuff[0]
     assert stuff.any(dim=1).tolist() == [False, False, True]
     kerbs = BevMap(np.zeros((8, 16), np.uint8), (-8, 8), (-4, 4), {"kerb": 1})
     with pytest.raises(InputError, match="has the classes kerb, but the segmentation head learns drivable_road"):
@@ -302,7 +307,7 @@ def test_the_bits_of_a_map_are_those_that_it_states() -> None:
 
 
 WEIGHTS = PerspectiveLossConfig(weight=1.0)
-NOTHING = DetectionTargets(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
+NOTHING = PaddedTargets.of_frame(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 10))
 # Two levels, of strides 8 and 16.
 TWO_LEVELS = replace(
     CONFIG,
@@ -331,7 +336,7 @@ def loss_of(
     config: PerspectiveLossConfig = WEIGHTS,
     *,
     has_image: torch.Tensor | None = None,
-    targets: tuple[DetectionTargets, ...] | None = None,
+    targets: PaddedTargets | None = None,
 ) -> dict[str, torch.Tensor]:
     inputs = data.inputs[0]
     truth = data.targets[0].perspective if targets is None else targets
@@ -369,7 +374,7 @@ def test_backbone_and_head_learn_the_depths_of_boxes() -> None:
     )
     errors = []
     for image, matrix in enumerate(inputs.image_from_bev.flatten(0, 1)):
-        truth = data.targets[0].perspective[image // 2]
+        truth = of_frame(data.targets[0].perspective, image // 2)
         expected = targets_of_image(matrix, truth, locations, inputs.image_size)
         errors.append((boxes[image, expected.locations, 2] - expected.boxes[:, 2]).exp() - 1)
         assert torch.equal(logits[image, expected.locations].argmax(-1), expected.labels)
@@ -404,7 +409,7 @@ def test_every_parameter_of_the_head_receives_a_gradient() -> None:
 
 def test_images_without_boxes_have_no_box_loss() -> None:
     data, head = batch(), make_head()
-    loss = loss_of(head, random_maps(4), data, targets=(NOTHING, NOTHING))
+    loss = loss_of(head, random_maps(4), data, targets=of_all([NOTHING, NOTHING]))
     assert loss["perspective boxes"] == 0
     assert loss["perspective classes"] > 0
     loss["perspective boxes"].backward()
@@ -428,7 +433,7 @@ def test_ignored_pixels_have_no_class_loss() -> None:
     """A truck beside a camera: its pixels may have any class logits."""
     data, head = batch(1), make_head(layers=0)
     matrix = data.inputs[0].image_from_bev[0, 0]
-    truck = DetectionTargets(torch.tensor([0]), torch.tensor([[2.5, -1, 1.1, 2.5, 0, 1.1, 0, -1, 0, 0]]))
+    truck = PaddedTargets.of_frame(torch.tensor([0]), torch.tensor([[2.5, -1, 1.1, 2.5, 0, 1.1, 0, -1, 0, 0]]))
     locations = feature_locations(((12, 16), (6, 8)), data.inputs[0].image_size, torch.device("cpu"))
     ignored = targets_of_image(matrix, truck, locations, data.inputs[0].image_size).ignored
     assert 0 < ignored.sum() < len(ignored)
@@ -440,7 +445,7 @@ def test_ignored_pixels_have_no_class_loss() -> None:
             logits, boxes = head(features)
             return torch.where(pixels[:, None], 9.0, logits), boxes
 
-        return loss_of(high, maps, data, has_image=only_front, targets=(truck,))["perspective classes"]
+        return loss_of(high, maps, data, has_image=only_front, targets=truck)["perspective classes"]
 
     nowhere = torch.zeros_like(ignored)
     assert head_with_high_logits(ignored) == head_with_high_logits(nowhere)
@@ -454,10 +459,10 @@ def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
     locations = feature_locations(((12, 16), (6, 8)), inputs.image_size, torch.device("cpu"))
     total, count = 0.0, 0
     for frame in range(2):
-        truth = both.targets[0].perspective[frame]
+        truth = of_frame(both.targets[0].perspective, frame)
         part = perspective_loss(
             head, [features[2 * frame : 2 * frame + 2] for features in maps], inputs.image_from_bev[[frame]],
-            inputs.has_image[[frame]], inputs.image_size, [truth], WEIGHTS,
+            inputs.has_image[[frame]], inputs.image_size, truth, WEIGHTS,
         )  # fmt: skip
         positives = sum(
             len(targets_of_image(matrix, truth, locations, inputs.image_size).locations)
@@ -488,4 +493,4 @@ def test_boxes_outside_the_grid_are_detected_too() -> None:
     config = replace(TWO_LEVELS, bev_grid=replace(TWO_LEVELS.bev_grid, y_range_m=(-6, 6)))
     data = batch_of(PaintedDrives(1), [Clip(0, (1,))], config)
     targets = data.targets[0]
-    assert len(targets.detection[0].labels) < len(targets.perspective[0].labels) == 5
+    assert targets.detection.counts[0] < targets.perspective.counts[0] == 5

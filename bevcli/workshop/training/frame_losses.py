@@ -37,7 +37,7 @@ from bevcli.parsing.documents import CountOrNone, NotNegative
 from bevcli.workshop.training import losses
 from bevcli.workshop.training.augmentation import renormalised
 from bevcli.workshop.training.samples import Batch
-from bevcli.workshop.training.targets import AnyTargets, PaddedTargets, Targets, padded
+from bevcli.workshop.training.targets import PaddedTargets, Targets
 
 BOX_NUMBERS = 8  # offset x, offset y, log depth, log length, log width, log height, sin, cos
 MAX_HALF_EXTENT = 8.0  # strides; a box with a larger half extent goes to a coarser level, as in FCOS (64 at stride 8)
@@ -291,7 +291,7 @@ def perspective_loss(
     image_from_bev: Tensor,
     has_image: Tensor,
     image_size: tuple[int, int],
-    targets: AnyTargets,
+    truth: PaddedTargets,
     config: PerspectiveLossConfig,
 ) -> dict[str, Tensor]:
     """Focal loss of all pixels and L1 loss of the positive ones, both divided by the number of positive pixels.
@@ -301,9 +301,9 @@ def perspective_loss(
         image_from_bev: (B, N, 4, 4), bev metres to pixels of the network's input.
         has_image: (B, N) bool; a camera without an image contributes nothing.
         image_size: (height, width) of the network's input, pixels.
-        targets: B, all boxes of a frame, also those outside the BEV grid.
+        truth: all boxes of B frames, also those outside the BEV grid.
     """
-    truth, cameras = padded(targets), image_from_bev.shape[1]
+    cameras = image_from_bev.shape[1]
     of_images = replace(
         truth, **{name: getattr(truth, name).repeat_interleave(cameras, 0) for name in ("labels", "codes", "exists")}
     )

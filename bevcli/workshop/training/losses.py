@@ -18,7 +18,7 @@ from bevcli.model.decoder import BOX_CODE_SIZE
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
 from bevcli.parsing.documents import NotNegative, Positive
-from bevcli.workshop.training.targets import AnyMasks, AnyTargets, PaddedTargets, padded, padded_masks
+from bevcli.workshop.training.targets import PaddedMasks, PaddedTargets
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss (Lin et al. 2017)
 UNUSABLE_COST = 1e5  # replaces a cost that is not finite, so that such a pair is chosen last
@@ -84,7 +84,7 @@ class DetectionLossConfig:
 
 
 def detection_loss(
-    class_logits: Tensor, box_codes: Tensor, targets: AnyTargets, config: DetectionLossConfig, groups: int = 1
+    class_logits: Tensor, box_codes: Tensor, truth: PaddedTargets, config: DetectionLossConfig, groups: int = 1
 ) -> dict[str, Tensor]:
     """The weighted losses of classes and boxes, summed over L decoder layers.
 
@@ -93,11 +93,10 @@ def detection_loss(
     Args:
         class_logits: (L, B, groups · Q, classes).
         box_codes: (L, B, groups · Q, 10).
-        targets: B.
+        truth: of B frames.
         groups: number of query groups, stored one after another. Each is matched on its own (Group DETR); the
             loss is the mean over the groups.
     """
-    truth = padded(targets)
     # (L, B, groups · Q, ...) -> (L · groups, B, Q, ...)
     logits, codes = (x.unflatten(2, (groups, -1)).movedim(2, 1).flatten(0, 1) for x in (class_logits, box_codes))
     with torch.no_grad():  # (..., B, Q, G) focal cost plus L1 distance of the box codes without velocity
@@ -180,13 +179,12 @@ class DenseHead(nn.Module):
 
 
 def dense_loss(
-    head: DenseHead, bev: Tensor, targets: AnyTargets, config: DenseLossConfig, detection: DetectionLossConfig
+    head: DenseHead, bev: Tensor, truth: PaddedTargets, config: DenseLossConfig, detection: DetectionLossConfig
 ) -> dict[str, Tensor]:
     """Focal loss of all cells and L1 loss of the positive ones, divided by the number of positive cells.
 
-    bev: (B, Y·X, C). targets: B. detection: the weights of classes and boxes, as in the detection loss.
+    bev: (B, Y·X, C). truth: of B frames. detection: the weights of classes and boxes, as in the detection loss.
     """
-    truth = padded(targets)
     logits, codes = head(bev)
     # The nearest object of each cell. Not by a product of matrices, which a GPU may round.
     distances = torch.cdist(head.centers, truth.codes[..., :2], compute_mode="donot_use_mm_for_euclid_dist")
@@ -210,14 +208,14 @@ class SegmentationLossConfig:
 
 
 def segmentation_loss(
-    outputs: SegmentationOutputs, targets: AnyMasks, config: SegmentationLossConfig
+    outputs: SegmentationOutputs, truth: PaddedMasks, config: SegmentationLossConfig
 ) -> dict[str, Tensor]:
     """The weighted losses of all layers for B frames. Things are matched once, by the outputs of the last layer.
 
     The losses of things are divided by the number of things in the batch, those of stuff by the number of stuff masks,
     so that many vehicles do not outweigh the road. A frame without a map trains no stuff query.
     """
-    truth, first = padded_masks(targets), len(STUFF_CLASSES)
+    first = len(STUFF_CLASSES)
     with torch.no_grad():  # (B, T, G) of each thing query and each vehicle, by the last layer
         costs = config.class_weight * focal_cost(outputs.class_logits[-1, :, first:])[..., None]
         costs = costs + config.location_weight * torch.cdist(outputs.locations[-1], truth.locations, p=1)
@@ -233,7 +231,7 @@ def segmentation_loss(
     of_things = assigned[:, first:]
     class_targets.scatter_add_(-1, *(x.expand(layers, -1, -1) for x in (queries, of_things)))
     class_losses = focal_loss(outputs.class_logits, class_targets)
-    of_stuff = class_losses[..., :first] * truth.has_stuff[:, None]
+    of_stuff = class_losses[..., :first] * truth.has_stuff
     classes = of_stuff.sum() / stuff + class_losses[..., first:].sum() / things
 
     logits = _of_queries(outputs.mask_logits, queries)  # (M, B, G, Y·X)

@@ -6,9 +6,12 @@ The boxes and masks of one frame are made on the CPU; a batch has them padded, s
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,13 +26,7 @@ from bevcli.model.decoder import encode
 from bevcli.model.segmentation import STUFF_CLASSES
 from bevcli.model.upload import exchanged, pinned, tensors_in, upload
 
-
-@dataclass(frozen=True)
-class DetectionTargets:
-    """The G ground truth boxes of one frame."""
-
-    labels: Tensor  # (G,) int64, indices into the model's classes
-    codes: Tensor  # (G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN
+T = TypeVar("T", "PaddedTargets", "PaddedMasks")
 
 
 @dataclass(frozen=True)
@@ -37,53 +34,48 @@ class PaddedTargets:
     """The ground truth boxes of B frames, padded to the G boxes of the frame with the most, at least 1."""
 
     labels: Tensor  # (B, G) int64, indices into the model's classes; 0 for padding
-    codes: Tensor  # (B, G, 10) float32 box codes; 0 for padding
+    # (B, G, 10) float32 box codes (see `bevcli.model.decoder`); unknown velocities are NaN; 0 for padding
+    codes: Tensor
     exists: Tensor  # (B, G) bool, false for padding
     counts: tuple[int, ...]  # B numbers of boxes
 
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    def __getitem__(self, frame: int) -> DetectionTargets:
-        """The boxes of one frame."""
-        count = self.counts[frame]
-        return DetectionTargets(self.labels[frame, :count], self.codes[frame, :count])
-
-
-AnyTargets = Sequence[DetectionTargets] | PaddedTargets  # of B frames
+    @staticmethod
+    def of_frame(labels: Tensor, codes: Tensor) -> "PaddedTargets":
+        """Of one frame: labels (G,) and codes (G, 10)."""
+        columns, count = (labels, codes, torch.ones_like(labels, dtype=torch.bool)), len(labels)
+        labels, codes, exists = (_padded(column[None], max(1, count)) for column in columns)
+        return PaddedTargets(labels, codes, exists, (count,))
 
 
-def padded(targets: AnyTargets) -> PaddedTargets:
-    """The boxes of B frames as tensors."""
-    if isinstance(targets, PaddedTargets):
-        return targets
-    counts = tuple(len(boxes.labels) for boxes in targets)
-    labels, codes = (pad_rows([getattr(boxes, name) for boxes in targets]) for name in ("labels", "codes"))
-    exists = pad_rows([torch.ones_like(boxes.labels, dtype=torch.bool) for boxes in targets])
-    return PaddedTargets(labels, codes, exists, counts)
+def _padded(tensor: Tensor, rows: int) -> Tensor:
+    """(B, G, ...) with zeros below -> (B, rows, ...)."""
+    return F.pad(tensor, (0, 0) * (tensor.ndim - 2) + (0, rows - tensor.shape[1]))
 
 
-def pad_rows(tensors: Sequence[Tensor]) -> Tensor:
-    """(B, G, ...) of B tensors (G_i, ...), padded with zeros to the largest of G_i, at least 1."""
-    rows = max(1, *map(len, tensors))
-    out = tensors[0].new_zeros(len(tensors), rows, *tensors[0].shape[1:])
-    for padded_rows, tensor in zip(out, tensors, strict=True):
-        padded_rows[: len(tensor)] = tensor
-    return out
+def of_all(parts: Sequence[T]) -> T:
+    """The boxes, or masks, of all frames of several parts."""
+    columns: list[Any] = []
+    for values in zip(*(vars(part).values() for part in parts), strict=True):
+        if isinstance(values[0], Tensor):
+            rows = max(value.shape[1] for value in values)
+            columns.append(torch.cat([_padded(value, rows) for value in values]))
+        else:
+            columns.append(tuple(chain(*values)))
+    return type(parts[0])(*columns)
 
 
-def detection_targets(boxes: Boxes3D, config: ModelConfig) -> DetectionTargets:
+def detection_targets(boxes: Boxes3D, config: ModelConfig) -> PaddedTargets:
     """The `box_targets` of the boxes (ground truth, bev frame) with a centre inside the BEV grid."""
     grid = config.bev_grid
     low, high = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m]).T
     return box_targets(boxes[((boxes.centers >= low) & (boxes.centers <= high)).all(-1)], config.classes)
 
 
-def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> DetectionTargets:
-    """Targets from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
+def box_targets(boxes: Boxes3D, classes: tuple[str, ...]) -> PaddedTargets:
+    """Targets of one frame from all boxes (ground truth, bev frame) that have one of the classes and visible points."""
     kept = boxes[np.isin(boxes.classes, classes) & has_points(boxes)]
     labels = [classes.index(name) for name in kept.classes]
-    return DetectionTargets(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
+    return PaddedTargets.of_frame(torch.tensor(labels, dtype=torch.int64), torch.from_numpy(encode(kept)).float())
 
 
 def has_points(boxes: Boxes3D) -> NDArray[np.bool_]:
@@ -97,48 +89,23 @@ SAMPLES = 8  # sampling points along each side of a BEV cell
 
 
 @dataclass(frozen=True)
-class SegmentationTargets:
-    """The masks of one frame: S stuff classes and G vehicles."""
-
-    stuff: Tensor | None  # (S, Y·X) float32, 0 or 1, in the order of STUFF_CLASSES; None without a map
-    things: Tensor  # (G, Y·X) float32 masks of 0 and 1
-    locations: Tensor  # (G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid
-
-
-@dataclass(frozen=True)
 class PaddedMasks:
     """The masks of B frames, padded with zeros to the G vehicles of the frame with the most, at least 1."""
 
-    stuff: Tensor  # (B, S, Y·X) float32; 0 where a frame has no map
-    has_stuff: Tensor  # (B,) bool, whether a frame has a map
-    things: Tensor  # (B, G, Y·X) float32
-    locations: Tensor  # (B, G, 4) float32
+    stuff: Tensor  # (B, S, Y·X) float32, 0 or 1, in the order of STUFF_CLASSES; 0 where a frame has no map
+    has_stuff: Tensor  # (B, 1) bool, whether a frame has a map
+    things: Tensor  # (B, G, Y·X) float32 masks of 0 and 1
+    # (B, G, 4) float32 centre x, y and extent x, y of each vehicle, as fractions (0 to 1) of the grid
+    locations: Tensor
     counts: tuple[int, ...]  # B numbers of vehicles
 
-    def __len__(self) -> int:
-        return len(self.counts)
-
-    def __getitem__(self, frame: int) -> SegmentationTargets:
-        """The masks of one frame."""
-        stuff, count = self.stuff[frame] if self.has_stuff[frame] else None, self.counts[frame]
-        return SegmentationTargets(stuff, self.things[frame, :count], self.locations[frame, :count])
-
-
-AnyMasks = Sequence[SegmentationTargets] | PaddedMasks  # of B frames
-
-
-def padded_masks(targets: AnyMasks) -> PaddedMasks:
-    """The masks of B frames as tensors."""
-    if isinstance(targets, PaddedMasks):
-        return targets
-    nothing = targets[0].things.new_zeros(len(STUFF_CLASSES), targets[0].things.shape[-1])
-    return PaddedMasks(
-        torch.stack([nothing if masks.stuff is None else masks.stuff for masks in targets]),
-        torch.tensor([masks.stuff is not None for masks in targets]),
-        pad_rows([masks.things for masks in targets]),
-        pad_rows([masks.locations for masks in targets]),
-        tuple(len(masks.things) for masks in targets),
-    )
+    @staticmethod
+    def of_frame(stuff: Tensor | None, things: Tensor, locations: Tensor) -> "PaddedMasks":
+        """Of one frame: stuff (S, Y·X), None without a map; things (G, Y·X) and locations (G, 4)."""
+        count, has_stuff = len(things), torch.tensor([[stuff is not None]])
+        stuff = things.new_zeros(len(STUFF_CLASSES), things.shape[-1]) if stuff is None else stuff
+        things, locations = (_padded(column[None], max(1, count)) for column in (things, locations))
+        return PaddedMasks(stuff[None], has_stuff, things, locations, (count,))
 
 
 def segmentation_targets(
@@ -146,17 +113,17 @@ def segmentation_targets(
     bev_map: BevMap | None,
     grid: BevGrid,
     classes: Mapping[str, ObjectClass] = NUSCENES_CLASSES,
-) -> SegmentationTargets:
-    """Masks on the BEV grid. Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
+) -> PaddedMasks:
+    """Masks of one frame on the BEV grid. boxes: its ground truth boxes, bev frame.
 
-    boxes: the frame's ground truth boxes, bev frame.
+    Raises InputError if the map does not cover the grid, or has none of STUFF_CLASSES.
     """
     names = [name for name, settings in classes.items() if settings.vehicle]
     vehicles = boxes[np.isin(boxes.classes, names) & has_points(boxes)]
     vehicles = vehicles[(grid.cell_of(vehicles.centers[:, :2]) >= 0).all(-1)]
     stuff = None if bev_map is None else torch.from_numpy(_stuff(bev_map, grid)).float()
     footprints, locations = (torch.from_numpy(make(vehicles, grid)).float() for make in (_footprints, _locations))
-    return SegmentationTargets(stuff, footprints, locations)
+    return PaddedMasks.of_frame(stuff, footprints, locations)
 
 
 def _stuff(bev_map: BevMap, grid: BevGrid) -> NDArray[np.bool_]:
@@ -237,13 +204,11 @@ class Targets:
 
 
 def joined_targets(batches: Sequence[Targets]) -> Targets:
-    masks = [
-        batch.segmentation[frame] for batch in batches if batch.segmentation for frame in range(len(batch.segmentation))
-    ]
+    masks = [batch.segmentation for batch in batches if batch.segmentation is not None]
     return Targets(
-        padded([batch.detection[frame] for batch in batches for frame in range(len(batch.detection))]),
-        padded([batch.perspective[frame] for batch in batches for frame in range(len(batch.perspective))]),
-        padded_masks(masks) if masks else None,
+        of_all([batch.detection for batch in batches]),
+        of_all([batch.perspective for batch in batches]),
+        of_all(masks) if masks else None,
     )
 
 
@@ -258,9 +223,7 @@ def ground_truth_boxes(frame: Frame) -> Boxes3D:
 
 
 def frame_targets(frame: Frame, config: ModelConfig) -> Targets:
-    boxes = ground_truth_boxes(frame)
-    detection, perspective = padded([detection_targets(boxes, config)]), padded([box_targets(boxes, config.classes)])
-    if "segmentation" not in config.heads:
-        return Targets(detection, perspective, None)
-    masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
-    return Targets(detection, perspective, padded_masks([masks]))
+    boxes, masks = ground_truth_boxes(frame), None
+    if "segmentation" in config.heads:
+        masks = segmentation_targets(boxes, frame.ground_truth_map, config.bev_grid, config.object_classes)
+    return Targets(detection_targets(boxes, config), box_targets(boxes, config.classes), masks)
