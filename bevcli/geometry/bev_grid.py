@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.documents import Count
 
 
 @dataclass(frozen=True)
@@ -21,12 +22,12 @@ class BevGrid:
         pillar_points: number Z of reference points in a pillar.
     """
 
-    rows: int
-    columns: int
+    rows: Count
+    columns: Count
     x_range_m: tuple[float, float] = (-51.2, 51.2)
     y_range_m: tuple[float, float] = (-51.2, 51.2)
     z_range_m: tuple[float, float] = (-5.0, 3.0)
-    pillar_points: int = 4
+    pillar_points: Count = 4
 
     @property
     def cell_size_m(self) -> tuple[float, float]:

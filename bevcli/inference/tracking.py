@@ -16,6 +16,7 @@ from bevcli.frame import FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.geometry.transforms import Array
+from bevcli.parsing.documents import Count, NotNegative, Positive, Share
 
 OTHER = "other"  # the gate of classes that have none
 
@@ -24,35 +25,25 @@ OTHER = "other"  # the gate of classes that have none
 class TrackerConfig:
     """The parameters of the tracker: the table [tracking] of a model's TOML file."""
 
-    birth_score: float = 0.2  # an unmatched box with this score or more starts a track
-    keep_score: float = 0.1  # a box with this score or more can continue a track
-    confirm_frames: int = 2  # number of frames with a box after which a track is confirmed
+    birth_score: Share = 0.2  # an unmatched box with this score or more starts a track
+    keep_score: Share = 0.1  # a box with this score or more can continue a track
+    confirm_frames: Count = 2  # number of frames with a box after which a track is confirmed
     # time that a confirmed track lives without a box, in seconds. Other tracks end with the first frame without a box
-    coast_s: float = 1.5
-    carry_s: float = 3.0  # time that a track lives on boxes where no camera looks, in seconds
+    coast_s: NotNegative = 1.5
+    carry_s: NotNegative = 3.0  # time that a track lives on boxes where no camera looks, in seconds
     # a box is a duplicate when the centre of a better box of its class is closer than this many widths of the better
     # box. 0: no box is a duplicate
-    duplicate_widths: float = 1.0
+    duplicate_widths: NotNegative = 1.0
     # whether tracks move with the predicted velocity; if not, they stay where their last box is
     use_velocity: bool = True
     # the largest distance of a match, by class, "other" for other classes, 4 m if left out. `for_classes` adds those of
     # a model's classes
-    gates_m: Mapping[str, float] = field(default_factory=dict)
+    gates_m: Mapping[str, Positive] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.keep_score <= self.birth_score <= 1:
-            raise ValueError(
-                f"keep_score and birth_score must be 0 to 1, keep_score not above birth_score; found "
-                f"{self.keep_score:g} and {self.birth_score:g}"
-            )
-        if self.confirm_frames < 1 or self.coast_s < 0 or self.carry_s < 0 or self.duplicate_widths < 0:
-            raise ValueError(
-                "confirm_frames must be at least 1, coast_s, carry_s and duplicate_widths must not be negative; found "
-                f"{self.confirm_frames}, {self.coast_s:g}, {self.carry_s:g} and {self.duplicate_widths:g}"
-            )
-        for name, gate in self.gates_m.items():
-            if not gate > 0:
-                raise ValueError(f"gates_m.{name} must be above 0 m, found {gate:g}")
+        if self.keep_score > self.birth_score:
+            found = f"{self.keep_score:g} and {self.birth_score:g}"
+            raise ValueError(f"keep_score must not be above birth_score; found {found}")
 
     def for_classes(self, classes: Mapping[str, ObjectClass]) -> "TrackerConfig":
         """The parameters with a gate for each of a model's classes. Raises ValueError for a gate of no class."""

@@ -26,6 +26,7 @@ from bevcli.model.image_tokens import ImageTokensConfig
 from bevcli.model.nanodet import CHANNELS, NanoDetConfig
 from bevcli.model.resnet import ResNetConfig
 from bevcli.model.segmentation import SegmentationConfig
+from bevcli.parsing.documents import Count, Positive
 from bevcli.printing import counted
 
 # Largest values of the whole numbers of a model, by name or its last word; of any other number LARGEST_NUMBER.
@@ -45,11 +46,11 @@ class ImageConfig:
     """The network's input made of an image: resized, cropped, normalised in float, padded at right and bottom."""
 
     # (width, height) in pixels that an image is resized to. Images of another aspect ratio are scaled to fit inside
-    size: tuple[int, int]
+    size: tuple[Count, Count]
     mean: tuple[float, float, float]  # of each channel, subtracted, on the scale 0 to 255 and in color_order
-    std: tuple[float, float, float]  # of each channel, the divisor, on the same scale
+    std: tuple[Positive, Positive, Positive]  # of each channel, the divisor, on the same scale
     color_order: Literal["rgb", "bgr"]  # order of the channels, "rgb" or "bgr"
-    pad_divisor: int = 32  # width and height are padded with zeros to a multiple of it
+    pad_divisor: Count = 32  # width and height are padded with zeros to a multiple of it
     # "linear", as the published weights were trained, aliases where images shrink to less than half; "area" averages
     # the pixels that fall into one
     resize: Literal["linear", "area"] = "linear"
@@ -62,9 +63,9 @@ class ImageConfig:
     # images of wide cameras become larger than `size`: their median focal length becomes this, in pixels of the
     # network's input, so that objects at the same distance have the same size for every rig
     # (`bevcli.inference.preprocess.image_for_rig`). None: `size` holds for every rig
-    focal_px: float | None = None
+    focal_px: Positive | None = None
     # with `focal_px`, images become larger only as long as all images of a frame have no more pixels
-    max_pixels: int | None = None
+    max_pixels: Count | None = None
     # move the grey levels of dark, pale and foggy images into an ordinary range first
     # (`bevcli.inference.image_repair.auto_levels`), so that the model sees more in the dark and in fog
     auto_levels: bool = False
@@ -75,18 +76,13 @@ class ImageConfig:
     denoise: bool = False
 
     def __post_init__(self) -> None:
-        if min(self.size) < 1 or min(self.std) <= 0 or self.pad_divisor < 1:
-            raise ValueError("size, std and pad_divisor must be positive")
         left, top, right, bottom = self.crop_box
         if not (0 <= left < right <= self.size[0] and 0 <= top < bottom <= self.size[1]):
             raise ValueError("crop must be left, top, right, bottom inside size, left < right and top < bottom")
         if (self.focal_px is None) != (self.max_pixels is None):
             raise ValueError("focal_px and max_pixels must be given together")
-        if self.focal_px is not None and self.max_pixels is not None:
-            if self.crop is not None:
-                raise ValueError("crop and focal_px exclude each other: with focal_px the size depends on the rig")
-            if self.focal_px <= 0 or self.max_pixels < 1:
-                raise ValueError("focal_px and max_pixels must be positive")
+        if self.focal_px is not None and self.crop is not None:
+            raise ValueError("crop and focal_px exclude each other: with focal_px the size depends on the rig")
 
     @property
     def crop_box(self) -> tuple[int, int, int, int]:
@@ -183,9 +179,9 @@ class ModelConfig:
     bev_grid: BevGrid
     bev_frame: BevFrameConfig = field(default_factory=BevFrameConfig)
     training_rigs: TrainingRigsConfig = field(default_factory=TrainingRigsConfig)
-    rate_hz: float = 2.0
-    max_gap_s: float = 2.0
-    channels: int = 256
+    rate_hz: Positive = 2.0
+    max_gap_s: Positive = 2.0
+    channels: Count = 256
     heads: tuple[Literal["detection", "segmentation"], ...] = ("detection",)
     backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = field(default_factory=ResNetConfig)
     backbone_scale: tuple[int, int] = (1, 1)
@@ -202,8 +198,6 @@ class ModelConfig:
     def __post_init__(self) -> None:
         _check_numbers(self)
         grid, levels = self.bev_grid, self.neck.levels
-        if min(grid.rows, grid.columns, grid.pillar_points) < 1:
-            raise ValueError("bev_grid needs at least one row, column and pillar point")
         if any(start >= end for start, end in (grid.x_range_m, grid.y_range_m, grid.z_range_m)):
             raise ValueError("bev_grid: each range goes from a smaller to a larger number")
         object_classes(self.classes, self.class_settings)
@@ -214,8 +208,8 @@ class ModelConfig:
         smaller, whole = self.backbone_scale
         if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
             raise ValueError("backbone_scale must be at most 1, and image.pad_divisor times it a whole number")
-        if not self.cameras or min(self.channels, self.rate_hz, self.max_gap_s) <= 0:
-            raise ValueError("cameras must not be empty, channels, rate_hz and max_gap_s must be positive")
+        if not self.cameras:
+            raise ValueError("cameras must not be empty")
         if "detection" not in self.heads or len(set(self.heads)) < len(self.heads):
             raise ValueError('heads must name "detection", and no head twice')
         divisors = [2, self.encoder.attention_heads, self.decoder.attention_heads]

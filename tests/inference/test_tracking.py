@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from made_boxes import made_boxes
 
+from bevcli.config import TRACKING, settings_of_table
+from bevcli.errors import ConfigError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference.tracking import TrackerConfig, step
@@ -202,10 +204,15 @@ def test_a_frame_without_boxes_has_the_columns_too():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"birth_score": 0.1, "keep_score": 0.2}, {"birth_score": 1.1}, {"confirm_frames": 0}, {"coast_s": -1.0}]
+    ("wrong", "message"),
+    [
+        ({"birth_score": 0.1, "keep_score": 0.2}, "keep_score must not be above birth_score; found 0.2 and 0.1"),
+        ({"birth_score": 1.1}, '"tracking.birth_score" must be a number from 0 to 1, but is 1.1'),
+        ({"confirm_frames": 0}, '"tracking.confirm_frames" must be an integer of 1 or more'),
+        ({"coast_s": -1.0}, '"tracking.coast_s" must be a number of 0 or more'),
+        ({"gates_m": {"car": 0.0}}, '"tracking.gates_m.car" must be a number above 0'),
+    ],
 )
-def test_parameters_that_make_no_sense_are_errors(wrong):
-    with pytest.raises(ValueError):
-        TrackerConfig(**wrong)
-    with pytest.raises(ValueError, match=r"gates_m\.car must be above 0 m"):
-        TrackerConfig(gates_m={"car": 0.0})
+def test_parameters_that_make_no_sense_are_errors(wrong, message):
+    with pytest.raises(ConfigError, match=message):
+        settings_of_table({TRACKING: wrong}, TRACKING, TrackerConfig, "own.toml")

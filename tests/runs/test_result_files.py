@@ -429,5 +429,5 @@ def test_the_models_file_holds_the_parameters(tmp_path):
     with pytest.raises(ConfigError, match=r'unknown key "tracking\.birth"; did you mean "birth_score"'):
         load_table(file, TRACKING, TrackerConfig)
     file.write_text("[tracking]\nbirth_score = 0.1\nkeep_score = 0.2\n")
-    with pytest.raises(ConfigError, match=r"\[tracking\]: keep_score and birth_score"):
+    with pytest.raises(ConfigError, match=r"\[tracking\]: keep_score must not be above birth_score"):
         load_table(file, TRACKING, TrackerConfig)

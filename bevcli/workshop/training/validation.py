@@ -26,7 +26,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.inference.runner import Runner
 from bevcli.model.config import ModelConfig
 from bevcli.parsing.files import MIB, read_text
-from bevcli.printing import counted, one_line
+from bevcli.printing import aligned, counted, one_line
 from bevcli.sequences.files.boxes_file import ClassNames, FrameBoxes
 from bevcli.sequences.native.folder import BOXES_FILE
 from bevcli.sequences.open import count_labels, scenes_of
@@ -246,13 +246,10 @@ def _sides(pairs: list[tuple[Boxes3D, Boxes3D]]) -> tuple[list[Boxes3D], list[Bo
 
 def drives_table(drives: Sequence[DriveScores]) -> str:
     """A line for each drive, and the mean and the lowest mAP of the drives with ground truth."""
-    width = max(len("drive"), *(len(drive.name) for drive in drives))
-    lines = [f"{'drive':{width}}  cameras    mAP    NDS"]
-    lines += [f"{drive.name:{width}}  {drive.cameras:7}  {drive.mean_ap:.3f}  {drive.nd_score:.3f}" for drive in drives]
+    rows = [(x.name, str(x.cameras), f"{x.mean_ap:.3f}", f"{x.nd_score:.3f}") for x in drives]
     scored = [drive.mean_ap for drive in drives if not math.isnan(drive.mean_ap)]
-    if scored:
-        lines.append(f"mAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}")
-    return "\n".join(lines)
+    below = f"\nmAP: mean {fmean(scored):.3f}, lowest {min(scored):.3f}" if scored else ""
+    return aligned([("drive", "cameras", "mAP", "NDS"), *rows]) + below
 
 
 def _pairs(frames: list[tuple[FrameBoxes, FrameBoxes]]) -> FramePairs:
