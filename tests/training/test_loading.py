@@ -22,7 +22,7 @@ from torch import Tensor
 from bevcli.errors import InputError
 from bevcli.inference.preprocess import write_network_image
 from bevcli.model.config import ImageConfig
-from bevcli.workshop.synth.drives import FrameMemory, KeptDrives
+from bevcli.workshop.synth.drives import FrameMemory
 from bevcli.workshop.training.augmentation import AugmentationConfig, noisy
 from bevcli.workshop.training.job import free_memory
 from bevcli.workshop.training.samples import (
@@ -94,7 +94,7 @@ def test_batches_of_kept_images_are_those_of_images_read_anew(in_bytes: bool, mo
     monkeypatch.setattr(PaintedDrive, "load", lambda drive, place: reads.append(place) or load(drive, place))
     expected, counts = [plain(*turn) for turn in turns], []
     for kept_frames in (0, 3, 100):
-        made = replace(plain, drives=KeptDrives(plain.drives, FrameMemory(kept_frames * frame_bytes)))
+        made = replace(plain, memory=FrameMemory(kept_frames * frame_bytes))
         reads.clear()
         for turn, batch in zip(turns, expected, strict=True):
             assert_equal(made(*turn), batch)
@@ -104,13 +104,13 @@ def test_batches_of_kept_images_are_those_of_images_read_anew(in_bytes: bool, mo
 
 
 def test_kept_frames_stay_in_their_process() -> None:
-    drives = PaintedDrives(1, all_labelled=True)
-    kept = KeptDrives(drives, FrameMemory(10**9))
-    first = kept.open(0).load(0)
-    assert kept.open(0).load(0) is first
+    drive, kept = PaintedDrives(1, all_labelled=True).open(0), FrameMemory(10**9)
+    first = kept.load(drive, 0, 0)
+    assert kept.load(drive, 0, 0) is first
     copied = pickle.loads(pickle.dumps(kept))
     assert len(pickle.dumps(kept)) < 10**5
-    assert np.array_equal(copied.open(0).load(0).images["CAM_FRONT"].pixels_bgr, first.images["CAM_FRONT"].pixels_bgr)
+    again = copied.load(drive, 0, 0)
+    assert np.array_equal(again.images["CAM_FRONT"].pixels_bgr, first.images["CAM_FRONT"].pixels_bgr)
 
 
 def test_free_memory_is_within_the_limit_of_a_container(tmp_path: Path) -> None:

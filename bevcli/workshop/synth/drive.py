@@ -120,7 +120,7 @@ class RenderedDrive:
         rate_hz: frames per second.
         rig: the cameras, or a drawn rig with delays of its cameras (0 to 0.1 s), the motion of the vehicle's body,
             whether the looks are varied (`Looks`), and their material; default: `nuscenes_like_rig` at 400x225.
-        weather: one of WEATHER_NAMES; default: drawn from the seed. Raises InputError for another name.
+        weather: one of WEATHER_NAMES; default: drawn from the seed.
         assets: the meshes, if they are built already.
         supersampling: samples per pixel along each axis (anti-aliasing).
         threads: number of cameras rendered in parallel.

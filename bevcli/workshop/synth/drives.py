@@ -341,16 +341,3 @@ class KeptFrames(DerivedDrive):
 
     def load(self, index: int) -> Frame:
         return self._memory.load(self.drive, self._key, index)
-
-
-class KeptDrives:
-    """Drives whose frames are kept in memory; see `Drives`."""
-
-    def __init__(self, drives: Drives, memory: FrameMemory) -> None:
-        self._drives, self._memory, self.input_shapes = drives, memory, drives.input_shapes
-
-    def __len__(self) -> int:
-        return len(self._drives)
-
-    def open(self, index: int) -> Drive:
-        return KeptFrames(self._drives.open(index), self._memory, index)

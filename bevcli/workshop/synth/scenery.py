@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
 from bevcli.workshop.synth.catalog import TREE_KINDS, StreetFurniture, any_color, nameless
 from bevcli.workshop.synth.city import CORNER_M, DIRECTIONS, KERB_M, Block, CityPlan, right_of, side_of
@@ -70,9 +69,7 @@ WEATHER_NAMES = tuple(_KINDS)
 
 
 def make_weather(name: str, rng: np.random.Generator) -> Weather:
-    """The weather of a name, with sun and clouds drawn from `rng`. Raises InputError where the name is not known."""
-    if name not in _KINDS:
-        raise InputError(f"weather: expected {', '.join(WEATHER_NAMES[:-1])} or {WEATHER_NAMES[-1]}, found {name!r}")
+    """The weather of a name, with sun and clouds drawn from `rng`."""
     kind = _KINDS[name]
     azimuth, elevation = rng.uniform(0, 2 * np.pi), _drawn(kind.elevation, rng)
     sun = (np.array(kind.sun) * kind.strength).astype(np.float32)

@@ -16,7 +16,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
@@ -39,7 +39,7 @@ from bevcli.model.upload import pinned, tensors_in, upload
 from bevcli.parsing.documents import Count, Share
 from bevcli.printing import counted
 from bevcli.sequences.open import scenes_of
-from bevcli.workshop.synth.drives import Drives, InputShape
+from bevcli.workshop.synth.drives import Drives, FrameMemory, InputShape
 from bevcli.workshop.training.augmentation import (
     UNDISTORTED,
     AugmentationConfig,
@@ -252,6 +252,7 @@ class BatchMaker:
     with_gap: bool  # leave out a frame of the clips, see `draw_clips`
     plain: bool  # give the clips before augmentation too
     in_bytes: bool  # give images as bytes, see `write_bytes`
+    memory: FrameMemory = field(default_factory=lambda: FrameMemory(0))  # of the drives' frames
 
     def __call__(self, step: int, turn: int) -> Batch:
         """The batch of a step (0 to `clips.in_turn` - 1 are its turns). It depends on no other batch."""
@@ -267,7 +268,7 @@ class BatchMaker:
         """The frames of a clip, read, augmented and preprocessed; raises InputError where one has no ground truth."""
         config, augmentation, in_bytes = self.model, self.augmentation, self.in_bytes
         drive = self.drives.open(clip.drive)
-        loaded = [drive.load(index) for index in clip.frames]
+        loaded = [self.memory.load(drive, clip.drive, index) for index in clip.frames]
         shown, drawn = augmented(loaded, augmentation, random)
         prepared = _prepared(shown if in_bytes else [*map(distorted, shown, drawn)], config, in_bytes)
         inputs = _inputs(prepared, config)

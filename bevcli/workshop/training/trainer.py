@@ -39,7 +39,6 @@ from bevcli.workshop.synth.drives import (
     Drives,
     FolderDrives as FolderDrives,
     FrameMemory,
-    KeptDrives,
     count_frames as count_frames,
     read_split,
     scored_drives,
@@ -233,10 +232,9 @@ class Trainer:
         self._teacher = Teacher(job.model, taught, job.device) if taught.active else None
         kept_bytes = int(job.config.kept_share * free_memory() / (job.loaders * trainings_here()))  # of each loader
         self.maker = BatchMaker(
-            KeptDrives(job.drives, FrameMemory(kept_bytes)),
-            job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
+            job.drives, job.model.config, job.config.clips, job.config.augmentation, job.seed, job.group.rank,
             with_gap=job.model.config.trains_with_gaps, plain=self._teacher is not None and not taught.feature_weight,
-            in_bytes=job.device.type == "cuda",
+            in_bytes=job.device.type == "cuda", memory=FrameMemory(kept_bytes),
         )  # fmt: skip
         self._frozen: FrozenStages | None = None
         if frozen := job.model.backbone.frozen_stages:
