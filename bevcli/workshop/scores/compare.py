@@ -73,10 +73,15 @@ def _score(copies, scores, hits, errors, truth_count, error_row, limits, recalls
     limits: index of the first recall that counts, and the lowest precision.
     """
     first, min_precision = limits
-    aps, means, seen = np.zeros(len(hits)), np.ones(len(errors)), np.cumsum(copies)
+    # Loops, because numba compiles numpy's functions of whole arrays for as long as all else here.
+    aps, means, seen = np.zeros(len(hits)), np.ones(len(errors)), copies.copy()
+    for index in range(1, len(seen)):
+        seen[index] += seen[index - 1]
     for row in range(len(hits)):
         precision, at = _curve(copies, seen, scores, hits[row], truth_count, recalls)
-        aps[row] = np.maximum(precision[first:] - min_precision, 0.0).mean() / (1 - min_precision)
+        for recall in range(first, len(recalls)):
+            aps[row] += max(precision[recall] - min_precision, 0.0)
+        aps[row] = aps[row] / (len(recalls) - first) / (1 - min_precision)
         if row == error_row:
             for index in range(len(errors)):
                 means[index] = _mean_error(copies, scores, hits[row], errors[index], at, first)
