@@ -33,10 +33,8 @@ def without(camera, *words):
     return {key: value for key, value in camera.items() if not any(word in key for word in words)}
 
 
-def lidar2img(name):
-    projection = np.eye(4)
-    projection[:3, :3] = k_of(name)
-    return projection @ np.linalg.inv(pose(name)) @ EGO_FROM_LIDAR
+def lidar2cam(name):
+    return np.linalg.inv(pose(name)) @ EGO_FROM_LIDAR
 
 
 LIDAR2EGO = {
@@ -46,9 +44,9 @@ INFORMATION = {
     "sensor2ego": [{"token": "a", "cams": {name: bevdet(name) for name in NAMES}, **LIDAR2EGO}] * 2,
     "sensor2lidar": [{"cams": {name: without(bevdet(name), "sensor2ego") for name in NAMES}, **LIDAR2EGO}],
     "cam2ego": [{"images": {name: {"cam2img": k_of(name), "cam2ego": pose(name)} for name in NAMES}}],
-    "lidar2img": [
+    "lidar2cam": [
         {
-            "images": {name: {"lidar2img": lidar2img(name), "width": SIZE[0], "height": SIZE[1]} for name in NAMES},
+            "images": {name: {"cam2img": k_of(name), "lidar2cam": lidar2cam(name)} for name in NAMES},
             "lidar_points": {"lidar2ego": EGO_FROM_LIDAR},
         }
     ],
@@ -58,7 +56,7 @@ INFORMATION = {
 @pytest.mark.parametrize("names", INFORMATION)
 @pytest.mark.parametrize("form", [0, 2, 4, 5, "json"])
 def test_information_files_of_bevdet_and_mmdetection3d(tmp_path, names, form):
-    key = "data_list" if "2img" in names or names == "cam2ego" else "infos"
+    key = "data_list" if names in ("lidar2cam", "cam2ego") else "infos"
     document = {key: INFORMATION[names], "metadata": {"version": "v1.0-mini"}}
     path = tmp_path / f"nuscenes_infos_val.{'json' if form == 'json' else 'pkl'}"
     if form != "json":  # the protocol of a pickle

@@ -175,7 +175,7 @@ def write_calibration(path: Path, rig: CameraRig, facts: DriveFacts = DriveFacts
         document["geo_origin"] = dict(zip(ORIGIN_LIMITS, astuple(facts.geo_origin), strict=True))
     if not rig.ego_from_bev_assumed:
         document["ego_from_bev"] = transform_to_json(rig.ego_from_bev)
-    document["cameras"] = {camera.name: _camera_to_json(camera) for camera in rig.cameras}
+    document["cameras"] = {camera.name: camera_to_json(camera) for camera in rig.cameras}
     write_whole(path, f"{_lines(document)}\n".encode(), regular=regular)
 
 
@@ -196,7 +196,8 @@ def _parse_geo_origin(value: object, report: Report) -> GeoOrigin | None:
     return GeoOrigin(*degrees) if len(degrees) == len(ORIGIN_LIMITS) else None
 
 
-def _camera_to_json(camera: Camera) -> dict[str, Any]:
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """The camera as calibration.json has it."""
     entry: dict[str, Any] = {
         "width": int(camera.width),  # a reader of another package may have NumPy's
         "height": int(camera.height),
@@ -265,7 +266,7 @@ def parse_camera(name: str, value: object, report: Report) -> Camera | None:
 
 def checked_camera(camera: Camera, location: Path | str) -> Camera:
     """A camera that calibration.json may hold. where: start of an error message. Raises InputError for any other."""
-    return require(parse_camera, camera.name, _camera_to_json(camera), where=location, camera=camera.name)
+    return require(parse_camera, camera.name, camera_to_json(camera), where=location, camera=camera.name)
 
 
 def _parse_intrinsics(camera: Mapping[str, Any], report: Report) -> Array | None:

@@ -21,11 +21,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array, inverse, rigid, rotation_about_z
+from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
 from bevcli.parsing.files import is_there
 from bevcli.sequences.files.json_fields import array_of_numbers
 from bevcli.workshop.formats.camera_poses import AXES
 from bevcli.workshop.formats.markup import read_yaml
+from bevcli.workshop.formats.pose_readings import quaternions_of_angles
 
 NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw")
 ON_VEHICLE, VEHICLE = "sensors_calibration.yaml", "base_link"  # the file beside that of a kit, and its frame
@@ -90,10 +91,7 @@ def _frames(document: Any, path: Path) -> Frames:
 
 def _parent_from_frame(translation: Array, angles: Array) -> Array:
     """(4, 4) of URDF: metres, and roll, pitch and yaw about fixed axes, radians."""
-    roll, pitch, yaw = (np.eye(4), np.eye(4), rigid(rotation=rotation_about_z(angles[2])))
-    roll[1:3, 1:3] = rotation_about_z(angles[0])[:2, :2]
-    pitch[np.ix_([2, 0], [2, 0])] = rotation_about_z(angles[1])[:2, :2]
-    return rigid(translation) @ yaw @ pitch @ roll
+    return rigid(translation, rotation_from_quaternion(quaternions_of_angles(*angles[:, None])[0]))
 
 
 def _from_root(frames: Frames, frame: str) -> tuple[str, Array]:

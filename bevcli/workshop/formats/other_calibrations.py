@@ -6,7 +6,7 @@ and K and D in those beside it that `cam0_calib` names, of a lens of camodocal.
 
 An information file of BEVDet, BEVFormer and mmdetection3d, `nuscenes_infos_val.pkl` or the same as JSON, has the
 cameras of a sample: `cams` with `sensor2ego_rotation` and `cam_intrinsic`, or, from mmdetection3d 1.1 on, `images` with
-`cam2ego` and `cam2img`. Where only the lidar is named (`sensor2lidar_rotation`, `lidar2cam`, `lidar2img`), its pose on
+`cam2ego` and `cam2img`. Where only the lidar is named (`sensor2lidar_rotation`, `lidar2cam`), its pose on
 the vehicle (`lidar2ego`) is needed, or the rig is that of the lidar. Of a pickle, plain values and NumPy's arrays of
 numbers are read. Nothing is called or imported.
 """
@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.linalg import rq
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, inverse, rigid, rotation_from_quaternion
@@ -293,23 +292,19 @@ def _cameras(entry: Any, where: str) -> dict[str, dict[str, Any]]:
 
 def _camera(camera: dict[str, Any], ego_from_lidar: Array | None, where: str) -> dict[str, Any]:
     """The names and values of a camera that `cameras_of` reads."""
-    image_from_lidar, camera_from_lidar = (_transform(camera, where, name) for name in ("lidar2img", "lidar2cam"))
     intrinsics = _transform(camera, where, "cam_intrinsic", "cam2img")
-    ego_from_camera = _transform(camera, where, "sensor2ego", "cam2ego")
-    lidar_from_camera = _transform(camera, where, "sensor2lidar")
-    if camera_from_lidar is not None:
-        lidar_from_camera = inverse(camera_from_lidar)
-    if image_from_lidar is not None and (intrinsics is None or lidar_from_camera is None):
-        intrinsics, lidar_from_camera = _split(image_from_lidar)
     if intrinsics is None:
-        raise InputError(f"{where}: has no intrinsics (expected cam_intrinsic, cam2img or lidar2img)")
+        raise InputError(f"{where}: has no intrinsics (expected cam_intrinsic or cam2img)")
     made: dict[str, Any] = {key: camera[key] for key in ("width", "height") if key in camera}
     made["K"] = intrinsics[:3, :3].tolist()
-    if ego_from_camera is None and lidar_from_camera is not None and ego_from_lidar is not None:
-        ego_from_camera = ego_from_lidar @ lidar_from_camera
-    if ego_from_camera is not None:
-        return made | {"ego_from_camera": ego_from_camera.tolist()}
-    return made if lidar_from_camera is None else made | {"lidar2cam": inverse(lidar_from_camera).tolist()}
+    ego_from_camera = _transform(camera, where, "sensor2ego", "cam2ego")
+    lidar_from_camera, camera_from_lidar = (_transform(camera, where, name) for name in ("sensor2lidar", "lidar2cam"))
+    if camera_from_lidar is None and lidar_from_camera is not None:
+        camera_from_lidar = inverse(lidar_from_camera)
+    if ego_from_camera is None and camera_from_lidar is not None and ego_from_lidar is not None:
+        ego_from_camera = ego_from_lidar @ inverse(camera_from_lidar)
+    stated = {"ego_from_camera": ego_from_camera} if ego_from_camera is not None else {"lidar2cam": camera_from_lidar}
+    return made | {name: pose.tolist() for name, pose in stated.items() if pose is not None}
 
 
 def _transform(owner: dict[str, Any], where: str, *names: str) -> Array | None:
@@ -330,16 +325,6 @@ def _transform(owner: dict[str, Any], where: str, *names: str) -> Array | None:
             turned = rotation_from_quaternion(rotation.ravel()) if rotation.size == 4 else rotation.reshape(3, 3)
             return rigid(translation.ravel(), turned)
     return None
-
-
-def _split(image_from_lidar: Array) -> tuple[Array, Array]:
-    """(4, 4) intrinsics and lidar_from_camera of a projection."""
-    triangle, rotation = rq(image_from_lidar[:3, :3])
-    signs = np.diag(np.sign(np.diag(triangle)))
-    triangle, rotation = triangle @ signs, signs @ rotation
-    intrinsics, camera_from_lidar = np.eye(4), rigid(np.linalg.solve(triangle, image_from_lidar[:3, 3]), rotation)
-    intrinsics[:3, :3] = triangle / triangle[2, 2]
-    return intrinsics, inverse(camera_from_lidar)
 
 
 LARGEST_PICKLE, MOST_OPCODES = 256 * MIB, 3_000_000

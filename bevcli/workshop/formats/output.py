@@ -20,7 +20,7 @@ from bevcli.geometry.transforms import Pose
 from bevcli.parsing.images import encode_image
 from bevcli.printing import cell_of
 from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
-from bevcli.sequences.files.calibration_file import write_calibration
+from bevcli.sequences.files.calibration_file import camera_to_json, write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
 from bevcli.sequences.native.folder import BOXES_FILE, LINES_FILE, MAPS_FOLDER, FolderDrive
@@ -251,12 +251,7 @@ def same_rig(first: CameraRig, second: CameraRig) -> bool:
     return (
         first.names == second.names
         and np.array_equal(first.ego_from_bev, second.ego_from_bev)
-        and all(
-            (a.width, a.height, a.distortion) == (b.width, b.height, b.distortion)
-            and np.array_equal(a.intrinsics, b.intrinsics)
-            and np.array_equal(a.ego_from_camera, b.ego_from_camera)
-            for a, b in zip(first.cameras, second.cameras, strict=True)
-        )
+        and all(camera_to_json(a) == camera_to_json(b) for a, b in zip(first.cameras, second.cameras, strict=True))
     )
 
 

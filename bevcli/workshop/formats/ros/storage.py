@@ -369,24 +369,17 @@ def decompressed(compression: str, data: bytes, largest: int) -> bytes:
     compression: "zstd", "lz4", or "" for data that is not compressed.
     Raises ValueError for another kind, damaged data, or more than `largest` bytes. Data that is cut off may give less.
     """
-    decompressors = {"zstd": _from_zstd, "lz4": _from_lz4, "": lambda data, largest: data}
-    if compression not in decompressors:
+    try:
+        if compression == "zstd":
+            content = zstandard.ZstdDecompressor().stream_reader(data).read(largest + 1)
+        elif compression == "lz4":
+            content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, largest + 1))
+        else:
+            content = data
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise ValueError(str(error)) from None
+    if compression not in ("zstd", "lz4", ""):
         raise ValueError(f'unknown compression "{compression:.20}" (expected zstd, lz4 or none)')
-    content = decompressors[compression](data, largest + 1)
     if len(content) > largest:
         raise ValueError(f"has more than {largest} bytes when it is decompressed")
     return content
-
-
-def _from_zstd(data: bytes, largest: int) -> bytes:
-    try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(largest)
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None
-
-
-def _from_lz4(data: bytes, largest: int) -> bytes:
-    try:
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, largest))
-    except (RuntimeError, EOFError) as error:
-        raise ValueError(str(error)) from None
