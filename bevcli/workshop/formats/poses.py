@@ -5,7 +5,6 @@ radians, the order of a quaternion, the body and the direction of the poses) are
 decide; the unit of times follows from the times of the frames. A note says what was understood.
 """
 
-import math
 import re
 from array import array
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +56,7 @@ from bevcli.workshop.formats.pose_table import (
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
-_DIGITS = re.compile(r"(\d{1,18})(?:\.(\d{0,18}))?", re.ASCII)  # a time with all of its digits
+_DIGITS = re.compile(r"\d{1,18}(?:\.\d{0,18})?", re.ASCII)  # a time with all of its digits
 POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
 ANGLES = ("vector", "radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # those of feet are stated
@@ -165,13 +164,13 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
     elif not table.has("time"):
         examples = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
         raise InputError(f"{table.path}: a column of times is missing (expected a name such as {examples})")
-    whole, rest = _exact(table)
+    rough = np.fromiter(_exact(table), np.float64, count)
     unit_in_name = _UNIT_OF_NAME.search(table.columns["time"])
     of_name = cast("TimeKind | None", unit_in_name and (unit_in_name[1] or unit_in_name[2]))
-    unit = drive.stated.pose_times or of_name or _unit(table.row(0), whole, rest, positions, drive)
-    if int(np.abs(whole).max()) * UNITS_NS[unit] > LARGEST_INTEGER:
+    unit = drive.stated.pose_times or of_name or _unit(table.row(0), rough, positions, drive)
+    if np.abs(rough).max() * UNITS_NS[unit] > LARGEST_INTEGER:
         raise InputError(f"{table.path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)")
-    times = _nanoseconds(whole, rest, unit)
+    times = np.fromiter((round(time * UNITS_NS[unit]) for time in _exact(table)), np.int64, count)
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
 
 
@@ -193,26 +192,10 @@ def _both(table: Table, seconds: str) -> NDArray[np.int64]:
     return np.array(times)
 
 
-def _exact(table: Table) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(T,) times without a unit, in all of their digits: whole numbers, and the rest in 1e-18."""
-    whole, rest = array("q"), array("q")
+def _exact(table: Table) -> Iterator[Decimal]:
+    """The times without a unit, in all of their digits."""
     for index, text in enumerate(table.texts("time")):
-        if (plain := _DIGITS.fullmatch(text)) is not None:
-            whole.append(int(plain[1]))
-            rest.append(int((plain[2] or "").ljust(18, "0")))
-            continue
-        value = _decimal(table.row(index))
-        if abs(value) > LARGEST_INTEGER:
-            raise table.row(index).error("time", f'"{text:.24}" is too large for a time in any unit')
-        whole.append(math.floor(value))
-        rest.append(int((value - whole[-1]).scaleb(18)))
-    return np.array(whole), np.array(rest)
-
-
-def _nanoseconds(whole: NDArray[Any], rest: NDArray[np.int64], unit: TimeKind) -> NDArray[np.int64]:
-    """(T,) times of `_exact` in a unit, to the nearest nanosecond."""
-    step = 10**18 // UNITS_NS[unit]
-    return whole * UNITS_NS[unit] + (rest + step // 2) // step
+        yield Decimal(text) if _DIGITS.fullmatch(text) else _decimal(table.row(index))
 
 
 def _decimal(row: CsvRow) -> Decimal:
@@ -229,18 +212,17 @@ def _decimal(row: CsvRow) -> Decimal:
         return Decimal(since // timedelta(microseconds=1)) / 10**6
     if not value.is_finite():
         raise row.error("time", f'expected a time, found "{text:.24}": correct or remove the row')
+    if abs(value) > LARGEST_INTEGER:
+        raise row.error("time", f'"{text:.24}" is too large for a time in any unit')
     if value.as_tuple().exponent > 0:  # type: ignore[operator]
         raise row.error("time", f'the last digits of "{text:.24}" are lost: write the file anew from its source')
     return value
 
 
-def _unit(
-    first: CsvRow, whole: NDArray[np.int64], rest: NDArray[np.int64], positions: Array, drive: DrivePoses
-) -> TimeKind:
+def _unit(first: CsvRow, rough: Array, positions: Array, drive: DrivePoses) -> TimeKind:
     """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
     units = list(UNITS_NS)
-    steps = (whole - whole[0]) + (rest - rest[0]) / 1e18
-    durations, lengths = np.diff(steps), np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    durations, lengths = np.diff(rough), np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if len(durations) and (durations > 0).any():
         period = float(np.median(durations[durations > 0])) / 1e9
         speed = float(np.median(lengths[durations > 0] / durations[durations > 0])) * 1e9
@@ -248,7 +230,7 @@ def _unit(
             unit for unit, ns in UNITS_NS.items()
             if PERIODS_S[0] <= period * ns <= PERIODS_S[1] and speed / ns <= FASTEST_M_S
         ] or units  # fmt: skip
-    ends = {unit: _nanoseconds(whole[[0, -1]].astype(object), rest[[0, -1]], unit).tolist() for unit in units}
+    ends = {unit: (rough[[0, -1]] * UNITS_NS[unit]).tolist() for unit in units}
     if drive.times_ns is not None:
         covered = {unit: _covered(ends[unit][0], ends[unit][1], drive.times_ns) for unit in units}
         units = [unit for unit in units if covered[unit] == max(covered.values())]
@@ -262,7 +244,7 @@ def _unit(
     return units[0]
 
 
-def _covered(first: int, last: int, times_ns: NDArray[np.int64]) -> int:
+def _covered(first: float, last: float, times_ns: NDArray[np.int64]) -> int:
     """Number of frames that poses from `first` to `last`, ns, cover."""
     return sum(first - TOLERANCE_NS <= time <= last + TOLERANCE_NS for time in times_ns.tolist())
 
