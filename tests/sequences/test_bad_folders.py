@@ -182,9 +182,9 @@ def test_times_of_images_beside_a_table_that_states_them(drive, option):
         ("rate_hz = 0", "rate_hz"),
         ("rate_hz = true", "rate_hz"),
         ("start_ns = 1.5", "start_ns"),
-        ("fps = 2", '"fps"'),
-        ("[cameras.CAM_UP]\noffset_ns = 1", '"cameras.CAM_UP"'),
-        ("[cameras.CAM_BACK]\noffset_s = 1", '"cameras.CAM_BACK.offset_s"'),
+        ("fps = 2", "`fps`"),
+        ("[cameras.CAM_UP]\noffset_ns = 1", 'unknown camera "CAM_UP"'),
+        ("[cameras.CAM_BACK]\noffset_s = 1", "`offset_s`"),
         ("rate_hz =", "TOML"),
     ],
 )

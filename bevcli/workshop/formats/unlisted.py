@@ -10,16 +10,16 @@ rate_hz = 24.0
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion
-from bevcli.parsing.documents import TOML_BYTES, parse_toml
+from bevcli.parsing.documents import TOML_BYTES, parse_toml, typed
 from bevcli.parsing.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_there, read_text
 from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
@@ -38,18 +38,30 @@ from bevcli.workshop.formats.name_times import NUMBER, Reading, listed_times, re
 from bevcli.workshop.formats.video_file import UNEVEN_TEXT, video_images
 
 FILE_NAME = "timing.toml"
+Nanoseconds = Annotated[int, Meta(ge=-LARGEST_NS, le=LARGEST_NS)]
 ASSUMED_RATE_HZ = 2.0  # rate of numbered images without timing.toml: the rate of the published models
 
 
-@dataclass(frozen=True)
-class Timing:
+class _Rate(Struct, forbid_unknown_fields=True):
+    rate_hz: float | None = None  # images per second, None if not stated
+
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not RATES_HZ[0] <= self.rate_hz <= RATES_HZ[1]:
+            raise ValueError("rate_hz: expected images per second, above 0")
+
+
+class CameraTiming(_Rate):
+    """What timing.toml states of one camera."""
+
+    offset_ns: Nanoseconds = 0  # delay of its first image
+
+
+class Timing(_Rate):
     """What timing.toml and the options state of images without a table."""
 
-    start_ns: int | None  # time of the first image, None if not stated
-    rate_hz: float | None  # images per second, None if not stated
-    times: TimeKind | None  # what the numbers in image names are, None if not stated
-    # delay of its first image, ns, and images per second, None if not stated, by camera
-    cameras: Mapping[str, tuple[int, float | None]]
+    start_ns: Nanoseconds | None = None  # time of the first image, None if not stated
+    times: TimeKind | None = None  # what the numbers in image names are, None if not stated
+    cameras: dict[str, CameraTiming] = {}
 
 
 def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = FolderOptions()) -> Timing:
@@ -58,34 +70,14 @@ def read_timing(folder: Path, cameras: tuple[str, ...], own: FolderOptions = Fol
     Raises InputError for broken TOML, an unknown key or camera, or an invalid value.
     """
     path = folder / FILE_NAME
-    stated = parse_toml(read_text(path, TOML_BYTES), path) if is_there(path) else {}
-    kinds = get_args(TimeKind)
-    _check_table(path, "", stated, ("start_ns", "rate_hz", "times", "cameras"))
-    if stated.get("times", "s") not in kinds:
-        raise InputError(f"{path}: times: expected one of {', '.join(kinds)}, found {stated['times']!r}")
-    _check_table(path, "cameras", stated.get("cameras", {}), cameras)
-    rate_hz, made = own.image_rate_hz or stated.get("rate_hz"), {}
-    for name in cameras:
-        table = stated.get("cameras", {}).get(name, {})
-        _check_table(path, f"cameras.{name}", table, ("offset_ns", "rate_hz"))
-        made[name] = table.get("offset_ns", 0), table.get("rate_hz", rate_hz)
-    start_ns = stated.get("start_ns") if own.start_ns is None else own.start_ns
-    return Timing(start_ns, rate_hz, own.times or stated.get("times"), made)
-
-
-def _check_table(path: Path, name: str, table: Any, known: tuple[str, ...]) -> None:
-    """Raise InputError for a table with a key that is not known, or a time or a rate that is none."""
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: {name}: expected a table, such as [{name}]")
-    for key, value in table.items():
-        where = ".".join(filter(None, (name, key)))
-        if key not in known:
-            raise InputError(f'{path}: unknown key "{where}" (known: {", ".join(known)})')
-        if key in ("start_ns", "offset_ns") and (type(value) is not int or abs(value) > LARGEST_NS):
-            raise InputError(f"{path}: {where}: expected an integer (nanoseconds), found {value!r}")
-        is_rate = type(value) in (int, float) and RATES_HZ[0] <= value <= RATES_HZ[1]
-        if key == "rate_hz" and not is_rate:
-            raise InputError(f"{path}: {where}: expected images per second, above 0, found {value!r}")
+    stated = typed(parse_toml(read_text(path, TOML_BYTES), path) if is_there(path) else {}, Timing, path)
+    for name in stated.cameras.keys() - set(cameras):
+        raise InputError(f'{path}: unknown camera "{name}" (known: {", ".join(cameras)})')
+    rate_hz = own.image_rate_hz or stated.rate_hz
+    of_cameras = {name: stated.cameras.get(name, CameraTiming()) for name in cameras}
+    made = {name: CameraTiming(of.rate_hz or rate_hz, of.offset_ns) for name, of in of_cameras.items()}
+    start_ns = stated.start_ns if own.start_ns is None else own.start_ns
+    return Timing(rate_hz, start_ns, own.times or stated.times, made)
 
 
 def find_frames(
@@ -166,7 +158,7 @@ def _from_times(paths: Mapping[str, list[Path]], reading: Reading, timing: Timin
     cameras = {}
     periods = measured_periods(reading.values)
     for camera, of_camera in paths.items():
-        times = reading.values[camera] + moved + timing.cameras[camera][0]
+        times = reading.values[camera] + moved + timing.cameras[camera].offset_ns
         order = np.argsort(times)
         sources = [ImageSource(of_camera[index], int(times[index])) for index in order.tolist()]
         cameras[camera] = CameraImages(f"the folder {of_camera[0].parent.name}", times[order], periods[camera],
@@ -216,7 +208,7 @@ def _from_indices(
     entries = list[FrameEntry]()
     for number in numbers:
         there = {camera: of[number] for camera, of in numbered.items() if number in of}
-        sources = {camera: ImageSource(path, times_of[camera][number] + timing.cameras[camera][0])
+        sources = {camera: ImageSource(path, times_of[camera][number] + timing.cameras[camera].offset_ns)
                    for camera, path in there.items()}  # fmt: skip
         time = times_of[next(iter(there))][number]
         dropped = {camera: f"no image {number} in {of_camera[0].parent}" for camera, of_camera in paths.items()
@@ -299,8 +291,8 @@ def _from_videos(folder: Path, timing: Timing) -> Found:
             found = ", ".join(path.name for path in of_camera) or "none"
             expected = f"one video, such as {camera}.mp4"
             raise InputError(f"{folder / 'videos'}: camera {camera}: expected {expected}, found {found}")
-        offset_ns, rate_hz = timing.cameras[camera]
-        videos[camera] = video_images(of_camera[0], (timing.start_ns or 0) + offset_ns, rate_hz)
+        start_ns = (timing.start_ns or 0) + timing.cameras[camera].offset_ns
+        videos[camera] = video_images(of_camera[0], start_ns, timing.cameras[camera].rate_hz)
     is_stated = timing.start_ns is not None or is_there(folder / FILE_NAME)
     stated = "times as stated" if is_stated else "times from 0 on (state `start_ns` (`--start-ns`))"
     entries, line = _matched(stated, videos)
