@@ -164,13 +164,15 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
     elif not table.has("time"):
         examples = "t, time, timestamp, stamp, or with the unit, such as timestamp_ns"
         raise InputError(f"{table.path}: a column of times is missing (expected a name such as {examples})")
-    rough = np.fromiter(_exact(table), np.float64, count)
     unit_in_name = _UNIT_OF_NAME.search(table.columns["time"])
     of_name = cast("TimeKind | None", unit_in_name and (unit_in_name[1] or unit_in_name[2]))
-    unit = drive.stated.pose_times or of_name or _unit(table.row(0), rough, positions, drive)
-    if np.abs(rough).max() * UNITS_NS[unit] > LARGEST_INTEGER:
+    unit = drive.stated.pose_times or of_name or _unit(table, positions, drive)
+    try:
+        times = np.fromiter((round(time * UNITS_NS[unit]) for time in _exact(table)), np.int64, count)
+    except OverflowError:
+        times = np.array([LARGEST_INTEGER + 1])
+    if np.abs(times).max() > LARGEST_INTEGER:
         raise InputError(f"{table.path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)")
-    times = np.fromiter((round(time * UNITS_NS[unit]) for time in _exact(table)), np.int64, count)
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
 
 
@@ -219,9 +221,9 @@ def _decimal(row: CsvRow) -> Decimal:
     return value
 
 
-def _unit(first: CsvRow, rough: Array, positions: Array, drive: DrivePoses) -> TimeKind:
+def _unit(table: Table, positions: Array, drive: DrivePoses) -> TimeKind:
     """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
-    units = list(UNITS_NS)
+    units, rough = list(UNITS_NS), np.fromiter(_exact(table), np.float64, len(table))
     durations, lengths = np.diff(rough), np.linalg.norm(np.diff(positions, axis=0), axis=1)
     if len(durations) and (durations > 0).any():
         period = float(np.median(durations[durations > 0])) / 1e9
@@ -239,7 +241,7 @@ def _unit(first: CsvRow, rough: Array, positions: Array, drive: DrivePoses) -> T
     if len(units) > 1:
         words = " or ".join(WORDS[unit] for unit in units)
         options = " or ".join(f"`pose_times={unit}` (`--pose-times`)" for unit in units)
-        message = f"{first.path}: the times ({first.cells['time']:.40}, …) may be {words}: pass {options}"
+        message = f"{table.path}: the times ({table.row(0).cells['time']:.40}, …) may be {words}: pass {options}"
         raise (FrameTimesNeeded if drive.times_ns is None else InputError)(message)
     return units[0]
 
