@@ -214,10 +214,10 @@ def _decimal(row: CsvRow) -> Decimal:
         return Decimal(since // timedelta(microseconds=1)) / 10**6
     if not value.is_finite():
         raise row.error("time", f'expected a time, found "{text:.24}": correct or remove the row')
-    if abs(value) > LARGEST_INTEGER:
-        raise row.error("time", f'"{text:.24}" is too large for a time in any unit')
     if value.as_tuple().exponent > 0:  # type: ignore[operator]
         raise row.error("time", f'the last digits of "{text:.24}" are lost: write the file anew from its source')
+    if abs(value) > LARGEST_INTEGER:
+        raise row.error("time", f'"{text:.24}" is too large for a time in any unit')
     return value
 
 
