@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from functools import cache
 from importlib import resources
@@ -22,6 +22,7 @@ from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.decoder import DecoderConfig
 from bevcli.model.encoder import EncoderConfig
 from bevcli.model.fpn import FPNConfig
+from bevcli.model.network import Network
 from bevcli.model.resnet import ResNetConfig
 from bevcli.viewer import recording_file
 from bevcli.workshop.bevformer_v2 import NO_EGO_MOTION, BEVFormerV2, BEVFormerV2Config, BevFusionConfig
@@ -124,15 +125,19 @@ def mini_config() -> ModelConfig:
     )
 
 
-@pytest.fixture(scope="session")
-def mini_model(mini_config) -> BEVFormer:
-    """Random weights, the same in every test; attention weights and residual branches are not zero."""
+def stirred(make: Callable[[], Network]) -> Network:
+    """A model with random weights, the same in every test; attention weights and residual branches are not zero."""
     torch.manual_seed(0)
-    model = BEVFormer(mini_config).eval()
+    model = make().eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn_like(parameter))
     return model
+
+
+@pytest.fixture(scope="session")
+def mini_model(mini_config) -> BEVFormer:
+    return stirred(lambda: BEVFormer(mini_config))
 
 
 @pytest.fixture(scope="session")
@@ -141,11 +146,8 @@ def mini_vad(mini_config) -> VAD:
     settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
     lines = LineDecoderConfig(lines=8, line_points=5, layers=1, attention_heads=4, feed_forward_width=32, max_lines=6)
     motion = MotionConfig(modes=2, steps=3, attention_heads=4, feed_forward_width=32, max_line_distance=0.4)
-    torch.manual_seed(0)
-    model = VAD(VADConfig(**settings | {"name": "mini-vad"}, line_decoder=lines, motion=motion)).eval()
+    model = stirred(lambda: VAD(VADConfig(**settings | {"name": "mini-vad"}, line_decoder=lines, motion=motion)))
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
         model.line_decoder.class_branches[-1][-1].bias.zero_()
     return model
 
@@ -159,11 +161,6 @@ def window_model(mini_config):
 
     def make(*frames: int) -> BEVFormerV2:
         settings = {field.name: getattr(mini_config, field.name) for field in fields(mini_config)}
-        torch.manual_seed(0)
-        model = BEVFormerV2(BEVFormerV2Config(**{**settings, **changes}, frames=frames)).eval()
-        with torch.no_grad():
-            for parameter in model.parameters():
-                parameter.add_(0.05 * torch.randn_like(parameter))
-        return model
+        return stirred(lambda: BEVFormerV2(BEVFormerV2Config(**{**settings, **changes}, frames=frames)))
 
     return make

@@ -9,6 +9,7 @@ import pytest
 import torch
 from interrupted import run_frames
 from memory_drive import MemoryDrive, WithoutImages
+from shared_fixtures import stirred
 from stepping import CPU, run
 
 from bevcli.inference import run as run_model
@@ -198,11 +199,8 @@ def config(mini_config: ModelConfig) -> UniADConfig:
 @pytest.fixture(scope="module")
 def model(config: UniADConfig) -> UniAD:
     """Random weights with which some queries start tracks in each frame, and some tracks end."""
-    torch.manual_seed(0)
-    model = UniAD(config).eval()
+    model = stirred(lambda: UniAD(config))
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
         for branch in model.detection_head.class_branches:
             branch[-1].bias.fill_(-1.0)
     return model
