@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_line import invoked
 from forks import FORKS
 from memory_drive import MemoryDrive, make_camera
 from small_model import check_file, model_for_engines, small_inputs, step_of_file
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.cli.stop_signals import EndSignals
 from bevcli.config import load_config
 from bevcli.errors import BevcliError, ConfigError, InputError, WeightsError
@@ -261,21 +260,21 @@ def test_options_that_do_not_apply_are_named(small_file, int8_file):
 @pytest.mark.slow
 def test_every_command_runs_demo_from_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    command("export-onnx", "--model", "demo")
-    command("quantize", "demo.onnx", "--int8-drive", str(STREET), "--count", "4", "--check", str(STREET))
+    invoked("export-onnx", "--model", "demo")
+    invoked("quantize", "demo.onnx", "--int8-drive", STREET, "--count", "4", "--check", STREET)
     expected = [prediction.boxes for _, prediction in run(load_model("demo"), open_sequence(STREET))]
     for engine in entries("bevcli.engines"):
-        command("run", str(STREET), "--model", "demo.onnx", "--engine", engine, "--out", engine)
+        invoked("run", STREET, "--model", "demo.onnx", "--engine", engine, "--out", engine)
         found = json.loads((tmp_path / engine / "predictions.json").read_text())
         first = found["frames"][0]["boxes"][0]
         np.testing.assert_allclose(first["score"], expected[0].scores[0], atol=1e-3)
         summary = json.loads((tmp_path / engine / "summary.json").read_text())
         assert (summary["model"], summary["engine"], summary["untrained"]) == ("demo", engine, False)
-    scores = json.loads(command("validate", "--model", "demo-int8.onnx", "--data", str(STREET), "--json"))
-    reference = json.loads(command("validate", "--model", "demo", "--data", str(STREET), "--json"))
+    scores = json.loads(invoked("validate", "--model", "demo-int8.onnx", "--data", STREET, "--json").stdout)
+    reference = json.loads(invoked("validate", "--model", "demo", "--data", STREET, "--json").stdout)
     maps = [found["classes_with_ground_truth"]["mean_ap"] for found in (scores, reference)]
     assert abs(maps[0] - maps[1]) < 0.05  # a drive of few frames; docs/speed.md has more
-    timed = json.loads(command("bench", "--model", "demo-int8.onnx", "--count", "2", "--json"))
+    timed = json.loads(invoked("bench", "--model", "demo-int8.onnx", "--count", "2", "--json").stdout)
     assert (timed["precision"], timed["engine"]) == ("int8", "onnxruntime")
 
 
@@ -294,9 +293,3 @@ load_exported(Path({str(small_file)!r}), "openvino")
     done = subprocess.run([sys.executable, "-c", watched], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "CONNECTION" not in done.stderr
-
-
-def command(*arguments: str) -> str:
-    done = CliRunner().invoke(app, list(arguments))
-    assert done.exit_code == 0, (arguments, done.output, done.exception)
-    return done.stdout

@@ -8,11 +8,10 @@ from pathlib import Path
 import original_reference as original
 import pytest
 import torch
+from command_line import invoked
 from interrupted import run_frames
 from memory_drive import WithoutImages
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.errors import BevcliError
 from bevcli.inference.load import Model, load_model
@@ -143,13 +142,13 @@ def test_commands_export_check_and_time_a_window(tmp_path, monkeypatch):
         assert old in text
         text = text.replace(old, new)
     Path("small.toml").write_text(text)
-    checked = command("export-onnx", "--model", "small.toml", "--untrained", "--decode", "--check", str(STREET))
+    checked = invoked("export-onnx", "--model", "small.toml", "--untrained", "--decode", "--check", STREET).stdout
     largest = checked.splitlines()[-1].split()
     assert largest[0] == "largest"
     assert float(largest[2]) < 1e-3
-    timed = json.loads(command("bench", "--model", "small-v2.onnx", "--count", "1", "--json"))
+    timed = json.loads(invoked("bench", "--model", "small-v2.onnx", "--count", "1", "--json").stdout)
     assert (timed["model"], timed["engine"]) == ("small-v2", "onnxruntime")
-    scores = json.loads(command("validate", "--model", "small-v2.onnx", "--data", str(STREET), "--json"))
+    scores = json.loads(invoked("validate", "--model", "small-v2.onnx", "--data", STREET, "--json").stdout)
     assert "classes_with_ground_truth" in scores
 
 
@@ -160,9 +159,3 @@ def test_the_published_window_equals_ours_over_a_real_drive(shared, tmp_path):
     model = Model(original.rule_model_v2("v2-t2"))
     export_onnx(model.network, tmp_path / "model.onnx")
     agree(list(check_exported(tmp_path / "model.onnx", model, drive)), 4, logits=2e-3)  # found: 1.002e-3, boxes 4 mm
-
-
-def command(*arguments: str) -> str:
-    done = CliRunner().invoke(app, list(arguments))
-    assert done.exit_code == 0, (arguments, done.output, done.exception)
-    return done.stdout

@@ -11,11 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from command_line import invoked
 from memory_drive import MemoryDrive, make_rig
 from small_model import model_for_engines
-from typer.testing import CliRunner
 
-from bevcli.cli.main import app
 from bevcli.errors import BevcliError, InputError
 from bevcli.inference import run
 from bevcli.inference.load import Model, installed_engines, load_model
@@ -200,15 +199,13 @@ def test_demo_runs_by_its_name_in_int8(tmp_path, monkeypatch):
     for name, original in ORIGINAL.items():
         monkeypatch.setattr(module, name, original)
     options = ["--engine", "openvino", "--precision", "int8"]
-    done = CliRunner().invoke(app, ["run", str(STREET), *options, "--out", str(tmp_path / "run")])
-    assert done.exit_code == 0, done.output
+    done = invoked("run", STREET, *options, "--out", tmp_path / "run")
     assert "note: engine openvino, int8, calibrated with street" in done.stderr
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert (summary["engine"], summary["precision"], summary["model"]) == ("openvino", "int8", "demo")
     files = {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
-    done = CliRunner().invoke(app, ["validate", "--data", str(STREET), *options, "--json"])
-    assert done.exit_code == 0, done.output
-    reference = CliRunner().invoke(app, ["validate", "--data", str(STREET), "--json"])
+    done = invoked("validate", "--data", STREET, *options, "--json")
+    reference = invoked("validate", "--data", STREET, "--json")
     maps = [json.loads(one.stdout)["classes_with_ground_truth"]["mean_ap"] for one in (done, reference)]
     assert abs(maps[0] - maps[1]) < 0.05
     assert files == {path: path.stat().st_ino for path in tmp_path.glob("cache/bevcli/engines/*.onnx")}
