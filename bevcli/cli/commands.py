@@ -123,7 +123,9 @@ def project_debug(
 
     Exit code: 0 without errors, 3 with findings of severity error.
     """
+    from bevcli.inference.load import default_model
     from bevcli.rig.check_calibration import model_notes
+    from bevcli.sequences.files.calibration_file import CALIBRATION
 
     drive_options = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in drive_options:
@@ -143,7 +145,9 @@ def project_debug(
     if as_json:
         say(check.to_json())
     else:
-        notes = model_notes(check.rig, options.model or "demo")
+        drive = options.sequence or input
+        drive = drive.parent if drive.name == CALIBRATION else drive
+        notes = model_notes(check.rig, options.model or default_model([drive]))
         say(check.text(), "", *notes, "Written: " + ", ".join(map(str, written)))
     if check.errors:
         raise typer.Exit(ERRORS_FOUND)

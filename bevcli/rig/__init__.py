@@ -27,7 +27,7 @@ class CheckOptions:
         reads="path or name",
         default=None,
         help="Compare the rig with those that this model's weights were trained on: a model name or a FILE.toml. "
-        "Default: demo.",
+        "Default: that of `bevcli run`.",
         metavar="NAME|FILE",
         complete=complete_model,
     )

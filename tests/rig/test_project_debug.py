@@ -52,6 +52,15 @@ def undrawn(monkeypatch):
     return leave_out
 
 
+@pytest.mark.parametrize(("facts", "model"), [({}, "photographs"), ({"rendered": True}, "demo")])
+def test_the_rig_is_compared_with_those_of_the_model_that_would_run(tmp_path, undrawn, facts, model):
+    document = copy_of("six") | facts
+    document["cameras"] = {"CAM_FRONT": document["cameras"]["CAM_FRONT"]}
+    undrawn()
+    done = run(calibration(document, tmp_path), "--out", tmp_path / "out")
+    assert f"\nModel {model}: the rig is unlike " in done.stdout
+
+
 @pytest.fixture
 def small_drive(tmp_path):
     return write_drive(tmp_path / "drive")
