@@ -180,8 +180,13 @@ def quaternions_of_angles(roll: Array, pitch: Array, yaw: Array) -> Array:
 
 def product(a: Array, b: Array) -> Array:
     """(T, 4) products of quaternions w, x, y, z."""
-    w, v = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True), np.cross(a[:, 1:], b[:, 1:])
-    return np.concatenate([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + v], axis=1)
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
+    made = np.empty((max(len(a), len(b)), 4))  # column by column: a million poses take little memory
+    made[:, 0] = aw * bw - (ax * bx + ay * by + az * bz)
+    made[:, 1] = aw * bx + bw * ax + (ay * bz - az * by)
+    made[:, 2] = aw * by + bw * ay + (az * bx - ax * bz)
+    made[:, 3] = aw * bz + bw * az + (ax * by - ay * bx)
+    return made
 
 
 def conjugate(quaternions: Array) -> Array:
