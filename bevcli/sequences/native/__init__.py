@@ -69,6 +69,6 @@ class NativeFolder(FolderOptions, Format):
         """True for a folder with a file or folder of a native sequence, or with folders that are named like cameras."""
         if any((path / name).exists() for name in MARKERS):
             return True
-        from bevcli.workshop.formats.matching import has_camera_folders
+        from bevcli.workshop.formats.camera_names import has_camera_folders
 
         return has_camera_folders(path)

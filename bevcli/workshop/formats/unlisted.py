@@ -24,15 +24,13 @@ from bevcli.parsing.files import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_there, read_
 from bevcli.printing import counted
 from bevcli.sequences.images import FrameEntry, ImageSource
 from bevcli.sequences.native import LARGEST_NS, RATES_HZ, FolderOptions, TimeKind
+from bevcli.workshop.formats.camera_names import folder_of_images, match_names, renamed
 from bevcli.workshop.formats.matching import (
     CameraImages,
     Found,
-    folder_of_images,
     frames_at,
     match,
-    match_names,
     measured_periods,
-    renamed,
 )
 from bevcli.workshop.formats.name_times import NUMBER, Reading, listed_times, read_names
 from bevcli.workshop.formats.video_file import UNEVEN_TEXT, video_images
