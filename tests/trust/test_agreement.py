@@ -180,7 +180,7 @@ def test_boxes_are_kept_if_they_are_there_half_a_second_later(step_s: float):
 @pytest.mark.parametrize(("off_m", "within"), [(0.4, 4), (0.9, 3), (1.9, 2), (2.5, 1)])
 def test_a_fit_is_half_overlap_and_half_the_place_of_the_feet(off_m: float, within: int):
     wide = replace(boxes(("car", 10, 0)), sizes_lwh=np.array([[2.0, 8.0, 1.5]]))
-    (ours, _) = sightings(frame(), wide, seen(replace(wide, centers=wide.centers + [0, off_m, 0])), NUSCENES_CLASSES)
+    ours = sightings(frame(), wide, seen(replace(wide, centers=wide.centers + [0, off_m, 0])), NUSCENES_CLASSES)
     assert ours["fit"][0] == pytest.approx((ours["overlap"][0] + within / 4) / 2)
     assert ours["overlap"][0] == pytest.approx((8 - off_m) / (8 + off_m))
 

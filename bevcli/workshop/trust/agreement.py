@@ -7,7 +7,7 @@ that of our boxes to theirs. Without frames half a second apart, kept counts as 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,10 @@ RESAMPLES, ENDS = 1000, (5, 95)  # of the seconds; percentiles of the interval
 FEWEST_SECONDS, FEWEST_OBJECTS = 3, 20  # for an interval; for a score without a note
 RINGS_M = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0)
 # What whoever reads a score may hold it against; docs/trust.md says on which drives.
-USUAL = "labels 0.4 to 0.65, demo on rendered streets and photographs anywhere 0.15 to 0.35"
+USUAL = "labels 0.4 to 0.65, demo on rendered streets 0.15 to 0.35, photographs anywhere 0.1 to 0.3"
+
+# A frame, boxes in the world frame, and what the witness sees; None or no camera where it does not look.
+Held = tuple[Frame, Boxes3D, Seen | None]
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,7 @@ class FrameAgreement:
     """One frame: what is projected and seen in its images, within the range; and how many boxes are kept."""
 
     stamp: FrameStamp  # of the frame
-    ours: Sightings  # the projected boxes that are held against the witness, and those that explain one of its objects
-    theirs: Sightings  # the same of the witness
+    sightings: Sightings  # what is held against the other side, and what explains some of it
     # sums over the boxes: of scores that a frame half a second later keeps, and of scores; zeros without one
     kept: tuple[float, float] = (0.0, 0.0)
     is_looked_at: bool = False  # whether the witness saw the frame
@@ -45,7 +47,7 @@ class FrameAgreement:
     @property
     def differences(self) -> int:
         """Number of objects and of boxes without a partner."""
-        return int(sum((side["overlap"][side["counted"]] < PARTNER).sum() for side in (self.ours, self.theirs)))
+        return int((self.sightings["overlap"][self.sightings["counted"]] < PARTNER).sum())
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,6 @@ class Part:
 
 
 PART_COLUMNS = ("found", "of objects", "confirmed", "of boxes")
-NO_PART = Part(np.nan, 0, np.nan, 0)
 
 
 @dataclass(frozen=True)
@@ -115,8 +116,8 @@ class Agreement:
         names = ("score", "low", "high", "kept")
         yield Table("agreement", ("", *names, "frames", "looked at"), rows, dict.fromkeys(names, 2))
         for title in ("groups", "cameras", "distances"):
-            of_sides: list[Mapping[str, Part]] = [getattr(side, title) for side in sides]
-            rows = [(name, *(sum((astuple(one.get(name, NO_PART)) for one in of_sides), ()))) for name in of_sides[0]]
+            parts, empty = [getattr(side, title) for side in sides], _part(NOTHING)
+            rows = [(name, *chain(*(astuple(each.get(name, empty)) for each in parts))) for name in parts[0]]
             yield Table(title, (title, *PART_COLUMNS * len(sides)), rows, dict.fromkeys(PART_COLUMNS, 2))
         columns = ("shift of what is seen", "right px", "down px", "scale", "pairs")
         rows = [(name, *astuple(one)) for name, one in self.shifts.items()]
@@ -133,7 +134,7 @@ class Agreement:
 
 
 def compared(
-    frames: Iterable[tuple[Frame, Boxes3D, Seen | None]],
+    frames: Iterable[Held],
     classes: Mapping[str, ObjectClass],
     range_m: float,
     *,
@@ -141,16 +142,13 @@ def compared(
 ) -> Iterator[FrameAgreement]:
     """Each frame's boxes held against what the witness sees, and against the boxes half a second later.
 
-    frames: with the boxes of each in the world frame, and what the witness sees, by camera; None or no camera where it
-    did not look. classes: of the boxes. range_m: nothing beyond this distance is counted. has_poses: whether the drive
-    has ego-motion.
+    classes: of the boxes. range_m: nothing beyond it is counted. has_poses: whether the drive has ego-motion.
     """
     waiting = deque[tuple[FrameAgreement, Boxes3D]]()
     for frame, boxes, seen in frames:
         shown = boxes.scored(SHOWN_SCORE)
-        sides = sightings(frame, shown, seen or {}, classes)
-        for side in sides:
-            side["counted"] &= side["distance"] < range_m
+        found = sightings(frame, shown, seen or {}, classes)
+        found["counted"] &= found["distance"] < range_m
         while waiting:
             last, near = waiting[0]
             seconds = (frame.stamp.timestamp_ns - last.stamp.timestamp_ns) / 1e9
@@ -161,7 +159,7 @@ def compared(
             yield replace(last, kept=kept(near, shown, seconds)) if follows else last
             waiting.popleft()
         near = shown[np.linalg.norm(shown.centers - frame.world_from_ego.matrix[:3, 3], axis=1) < range_m - MARGIN_M]
-        waiting.append((FrameAgreement(frame.stamp, *sides, is_looked_at=bool(seen)), near))
+        waiting.append((FrameAgreement(frame.stamp, found, is_looked_at=bool(seen)), near))
     yield from (last for last, _ in waiting)
 
 
@@ -171,8 +169,6 @@ def kept(boxes: Boxes3D, following: Boxes3D, seconds: float) -> tuple[float, flo
     A box that is off by v m/s from where its velocity leads counts 1 - v / 8. All boxes are in the world frame.
     """
     scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
-    if not len(boxes) or not len(following):
-        return 0.0, float(scores.sum())
     there = boxes.centers[:, :2] + np.nan_to_num(boxes.velocities) * seconds
     off_m = np.linalg.norm(there[:, None] - following.centers[:, :2], axis=2)
     off_m[boxes.classes[:, None] != following.classes] = np.inf
@@ -184,10 +180,9 @@ def kept(boxes: Boxes3D, following: Boxes3D, seconds: float) -> tuple[float, flo
 def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
     """The agreement of all frames. worst: length of the list of frames that differ most."""
     looked = [frame for frame in frames if frame.is_looked_at]
-    ours, theirs = (
-        np.concatenate([NOTHING, *(side[side["counted"]] for side in sides)])
-        for sides in ([frame.ours for frame in looked], [frame.theirs for frame in looked])
-    )
+    found = np.concatenate([NOTHING, *(frame.sightings for frame in looked)])
+    counted, pairs = found[found["counted"]], found[~found["is_seen"] & (found["overlap"] >= PARTNER)]
+    objects, distances = int(counted["is_seen"].sum()), counted["distance"]
     seconds = np.array([_sums(frame) for frame in frames]).reshape(-1, 6)
     blocks = [f"{frame.stamp.scene} {frame.stamp.timestamp_ns // 10**9}" for frame in frames]
     names, block = np.unique(blocks, return_inverse=True)
@@ -195,27 +190,23 @@ def agreement(frames: Sequence[FrameAgreement], worst: int = 0) -> Agreement:
     np.add.at(sums, block, seconds)
     total = sums.sum(axis=0)
     score = low = high = None
-    if len(theirs):
+    if objects:
         score = float(_score(total))
         if len(sums) >= FEWEST_SECONDS:
             draws = np.random.default_rng(0).multinomial(len(sums), np.full(len(sums), 1 / len(sums)), RESAMPLES)
             low, high = (float(end) for end in np.percentile(_score(draws @ sums), ENDS))
-    order = sorted(looked, key=lambda frame: -frame.differences)[:worst]
-    cameras = dict.fromkeys([*theirs["camera"], *ours["camera"]])
-    pairs = np.concatenate([NOTHING, *(frame.ours[frame.ours["overlap"] >= PARTNER] for frame in looked)])
-    rings = {
-        f"{a:g}-{b:g} m": _part(*(side[(a <= side["distance"]) & (side["distance"] < b)] for side in (theirs, ours)))
-        for a, b in pairwise(RINGS_M)
-    }
+    order = sorted(((one.stamp, one.differences) for one in looked), key=lambda pair: -pair[1])[:worst]
+    cameras = dict.fromkeys(counted["camera"])
+    rings = {f"{a:g}-{b:g} m": _part(counted[(a <= distances) & (distances < b)]) for a, b in pairwise(RINGS_M)}
     return Agreement(
         *(score, low, high, float(total[4] / total[5]) if total[5] else np.nan),
-        {name: _part(*(side[side["group"] == index] for side in (theirs, ours))) for index, name in enumerate(GROUPS)},
-        {name: _part(*(side[side["camera"] == name] for side in (theirs, ours))) for name in cameras},
+        {name: _part(counted[counted["group"] == index]) for index, name in enumerate(GROUPS)},
+        {name: _part(counted[counted["camera"] == name]) for name in cameras},
         {name: part for name, part in rings.items() if part.objects or part.boxes},
         {name: _shift(pairs[pairs["camera"] == name]) for name in cameras},
         (len(frames), len(looked)),
-        tuple((frame.stamp, frame.differences) for frame in order if frame.differences),
-        notes=tuple(_notes(len(theirs))),
+        tuple(pair for pair in order if pair[1]),
+        notes=tuple(_notes(objects)),
     )
 
 
@@ -228,7 +219,8 @@ def _notes(objects: int) -> Iterator[str]:
 
 def _sums(frame: FrameAgreement) -> tuple[float, ...]:
     """Of the objects and of the boxes the fits and their number, then `kept`."""
-    sides = (side["fit"][side["counted"]] for side in (frame.theirs, frame.ours))
+    counted = frame.sightings[frame.sightings["counted"]]
+    sides = (counted["fit"][counted["is_seen"] == is_seen] for is_seen in (True, False))
     return (*(value for each in sides for value in (float(each.sum()), len(each))), *frame.kept)
 
 
@@ -239,9 +231,10 @@ def _score(sums: Array) -> Array:
     return np.asarray(2 * found * confirmed / np.maximum(found + confirmed, 1e-9) * same)
 
 
-def _part(theirs: Sightings, ours: Sightings) -> Part:
-    found, confirmed = (float((side["overlap"] >= PARTNER).mean()) if len(side) else np.nan for side in (theirs, ours))
-    return Part(found, len(theirs), confirmed, len(ours))
+def _part(counted: Sightings) -> Part:
+    sides = (counted["overlap"][counted["is_seen"] == is_seen] >= PARTNER for is_seen in (True, False))
+    (found, objects), (confirmed, boxes) = ((float(one.mean()) if len(one) else np.nan, len(one)) for one in sides)
+    return Part(found, objects, confirmed, boxes)
 
 
 def _shift(pairs: Sightings) -> Shift:

@@ -231,10 +231,9 @@ def camera_findings(
         advice = "mirror y of positions and rotations, or turn z up"
         message = "the poses are left-handed, or their z points down"
         return (Finding("motion-axes", "error", None, message, found, "x forward, y left, z up", advice),)
-    frames_ns = np.array([view.timestamp_ns for view in views])
     findings, left = list[Finding](), [each.names[0] for each in own]
     while left:
-        told = sorted(_told(points, rows, frames_ns, views[0].cameras, left, interval_ns), key=lambda one: -one[0])
+        told = sorted(_told(points, rows, views, left, interval_ns), key=lambda one: -one[0])
         if not told:
             break
         gained, mistake, found = told[0]
@@ -249,14 +248,10 @@ def camera_findings(
 
 
 def _told(
-    points: Items[Points],
-    rows: Poses,
-    frames_ns: NDArray[np.int64],
-    cameras: Items[Camera],
-    names: Items[str],
-    interval_ns: int,
+    points: Items[Points], rows: Poses, views: Items[FrameView], names: Items[str], interval_ns: int
 ) -> Iterator[tuple[float, Mistake, str]]:
     """Mistakes of the named cameras after whose undoing the points fit surely better: the cost gained, and in words."""
+    frames_ns, cameras = np.array([view.timestamp_ns for view in views]), views[0].cameras
     fitting, x = corrected(points, rows, frames_ns)
     whole = cost(misfits(points, fitting)) + float(x @ x)
     for camera in (camera for camera in cameras if camera.name in names):

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 
 from bevcli.frame import Drive, Frame, Prediction
-from bevcli.geometry.boxes import Boxes2D, Boxes3D
+from bevcli.geometry.boxes import Boxes2D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
 from bevcli.inference import run
 from bevcli.inference.load import Model
 from bevcli.workshop.scores.inputs import boxes_of_drive, open_predictions
-from bevcli.workshop.trust.agreement import Agreement, FrameAgreement, agreement, compared
+from bevcli.workshop.trust.agreement import Agreement, FrameAgreement, Held, agreement, compared
 from bevcli.workshop.trust.faults import find_faults
-from bevcli.workshop.trust.sightings import Seen
 from bevcli.workshop.trust.witness import load_witness, seen_in_run
 
 EVERY, SHORT = 3, 8  # the witness looks at every third frame, at each one of a drive with up to eight
@@ -81,7 +80,7 @@ def agreement_of_boxes(
     if any(there and not looked for there, looked in zip(in_run, looked_at, strict=True)):
         looked_at = [True] * len(looked_at)  # the model's own detector saw every frame
 
-    def frames() -> Iterator[tuple[Frame, Boxes3D, Seen]]:
+    def frames() -> Iterator[Held]:
         for place, own in enumerate(of_frames):
             if own is None:
                 continue
@@ -93,8 +92,8 @@ def agreement_of_boxes(
                 yield drive.ground_truth_frame(place), own, {name: there.get(name, NO_BOXES) for name in names}
 
     classes: Mapping[str, ObjectClass] = boxes.classes or NUSCENES_CLASSES
-    range_m = file.range_m or RANGE_M
-    return agreement(list(compared(frames(), classes, range_m, has_poses=drive.has_ego_motion)), worst)
+    held = compared(frames(), classes, file.range_m or RANGE_M, has_poses=drive.has_ego_motion)
+    return agreement(list(held), worst)
 
 
 def _is_looked_at(place: int, drive: Drive) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student_t
 
 from bevcli.errors import Finding, errors_of
-from bevcli.frame import Drive, Frame
+from bevcli.frame import Drive
 from bevcli.geometry.boxes import Boxes2D, Boxes3D
 from bevcli.geometry.transforms import Array
 from bevcli.inference import TORCH, run
@@ -24,9 +24,9 @@ from bevcli.sequences.open import select
 from bevcli.workshop.formats.pose_readings import Poses
 from bevcli.workshop.odometry.compare import chosen_frames, stated_motion_findings, stated_poses
 from bevcli.workshop.odometry.step_views import Viewer
-from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, agreement, compared
+from bevcli.workshop.trust.agreement import FEWEST_OBJECTS, Held, compared
 from bevcli.workshop.trust.camera_faults import camera_findings, points_of
-from bevcli.workshop.trust.sightings import Seen
+from bevcli.workshop.trust.sightings import PARTNER
 from bevcli.workshop.trust.witness import load_witness
 
 STEPS = 6  # between frames whose images are compared
@@ -97,22 +97,22 @@ def image_findings(names: Iterable[str], frames: Sequence[dict[str, Array]]) -> 
     frames: grey images (h, w) by camera, of successive frames.
     """
     findings, changes = list[Finding](), dict[str, float]()
+
+    def add(code: str, name: str, message: str, found: str) -> None:
+        findings.append(Finding(code, "error", name, message, found, "", "check the camera and its files"))
+
     for name in names:
         shown = [frame[name] for frame in frames if name in frame]
         if shown and max(image.std() for image in shown) < FLAT:
-            message, found = (
-                "its images show nothing",
-                f"grey levels {min(map(np.min, shown)):.0f} to {max(map(np.max, shown)):.0f}",
-            )
-            findings.append(Finding("camera-dead", "error", name, message, found, "", "check the camera and its files"))
+            levels = f"grey levels {min(map(np.min, shown)):.0f} to {max(map(np.max, shown)):.0f}"
+            add("camera-dead", name, "its images show nothing", levels)
         elif len(shown) > 1:
             changes[name] = max(float(np.abs(b - a).mean()) for a, b in pairwise(shown))
     usual = float(np.median(list(changes.values()) or [0.0]))
     for name, change in changes.items():
         if usual >= MOVING and change < STILL * usual:
             found = f"grey levels change by {change:.2f} between frames, those of the other cameras by {usual:.1f}"
-            message, advice = "its images are all the same", "check the camera and its files"
-            findings.append(Finding("camera-frozen", "error", name, message, found, "", advice))
+            add("camera-frozen", name, "its images are all the same", found)
     return tuple(findings)
 
 
@@ -122,11 +122,9 @@ def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
     first = (len(drive.stamps) - count) // 2
     some = select(drive, range(first, first + count))
     steps = list(run(model, some, temporal=False, track=False))
-    frames = [frame for frame, _ in steps]
-    seen = [load_witness().seen(frame) for frame in frames]
-    held = zip(frames, (one.boxes_world for _, one in steps), seen, strict=True)
+    held = [(frame, one.boxes_world, load_witness().seen(frame)) for frame, one in steps]
     broken = engine_findings(model, some, [one.boxes for _, one in steps])
-    return broken or (*color_findings(frames, seen), *weights_findings(model, held))
+    return broken or (*color_findings(held), *weights_findings(model, held))
 
 
 def engine_findings(model: Model, drive: Drive, boxes: Sequence[Boxes3D]) -> tuple[Finding, ...]:
@@ -145,16 +143,13 @@ def engine_findings(model: Model, drive: Drive, boxes: Sequence[Boxes3D]) -> tup
     return (Finding("engine-broken", "error", None, message, found, expected, advice),)
 
 
-def color_findings(frames: Sequence[Frame], seen: Sequence[Seen]) -> tuple[Finding, ...]:
-    """The finding about images whose red and blue are exchanged: the witness is surer in the other order.
-
-    seen: of the witness, by frame.
-    """
+def color_findings(frames: Iterable[Held]) -> tuple[Finding, ...]:
+    """The finding about images whose red and blue are exchanged: the witness is surer in the other order."""
     gains = list[float]()
-    for frame, as_stated in zip(frames, seen, strict=True):
+    for frame, _, as_stated in frames:
         images = {name: replace(one, pixels_bgr=one.pixels_bgr[..., ::-1]) for name, one in frame.images.items()}
         exchanged = load_witness().seen(replace(frame, images=images))
-        gains += [_clearest(exchanged[name]) - _clearest(boxes) for name, boxes in as_stated.items()]
+        gains += [_clearest(exchanged[name]) - _clearest(boxes) for name, boxes in (as_stated or {}).items()]
     if len(gains) < 2:
         return ()
     gain, deviation = float(np.mean(gains)), float(np.std(gains, ddof=1)) / len(gains) ** 0.5
@@ -170,18 +165,17 @@ def _clearest(boxes: Boxes2D) -> float:
     return float(boxes.scores[boxes.classes != "traffic light"][:CLEAREST].sum())
 
 
-def weights_findings(model: Model, frames: Iterable[tuple[Frame, Boxes3D, Seen]]) -> tuple[Finding, ...]:
-    """The finding about weights that find little of what the witness sees. frames: as for `compared`."""
-    range_m = model.config.bev_grid.nearest_side_m
-    parts = agreement(list(compared(frames, model.config.object_classes, range_m, has_poses=False))).groups.values()
-    objects = sum(part.objects for part in parts)
-    share = sum(part.found * part.objects for part in parts if part.objects) / max(objects, 1)
-    if objects < FEWEST_OBJECTS or share >= LEAST_FOUND:
+def weights_findings(model: Model, frames: Iterable[Held]) -> tuple[Finding, ...]:
+    """The finding about weights that find little of what the witness sees."""
+    range_m, classes = model.config.bev_grid.nearest_side_m, model.config.object_classes
+    seen = [one.sightings[one.sightings["is_seen"]] for one in compared(frames, classes, range_m, has_poses=False)]
+    found = np.concatenate([each["overlap"][each["counted"]] >= PARTNER for each in seen])
+    if len(found) < FEWEST_OBJECTS or found.mean() >= LEAST_FOUND:
         return ()
     message = "the model finds little of what a detector sees in the images"
-    found, expected = f"{share:.0%} of {objects} objects", f"{LEAST_FOUND:.0%} or more"
+    share, expected = f"{found.mean():.0%} of {len(found)} objects", f"{LEAST_FOUND:.0%} or more"
     advice = "take weights and model file of one training, check the engine, or use weights that know such images"
-    return (Finding("weights-broken", "warning", None, message, found, expected, advice),)
+    return (Finding("weights-broken", "warning", None, message, share, expected, advice),)
 
 
 def repeated(wanted: Sequence[Boxes3D], given: Sequence[Boxes3D]) -> tuple[int, float]:

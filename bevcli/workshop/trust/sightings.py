@@ -27,10 +27,11 @@ DOUBLE = 0.6  # overlap of two seen boxes of a group, such as a car and a truck,
 POINTS = np.linspace(0, 1, 5)  # of an edge of a box, which a lens bends
 
 Seen = Mapping[str, Boxes2D]  # camera -> the boxes that the witness sees in its image
-Sightings = NDArray[np.void]  # (N,) of SIGHTING: projected boxes of a model, or boxes that the witness sees
+Sightings = NDArray[np.void]  # (N,) of SIGHTING: projected boxes of a model, and boxes that the witness sees
 SIGHTING = np.dtype(
     [
         ("camera", np.object_),  # name
+        ("is_seen", np.bool_),  # by the witness; else it is projected
         ("corners", np.float64, 4),  # x0, y0, x1, y1 in the image, pixels
         ("group", np.int64),  # index into GROUPS
         # to the ego frame's origin, on flat ground for what is seen; metres, inf above the horizon
@@ -44,9 +45,10 @@ SIGHTING = np.dtype(
 NOTHING: Sightings = np.zeros(0, SIGHTING)
 
 
-def group_of(name: str, classes: Mapping[str, ObjectClass]) -> int:
-    """Index into GROUPS; -1 for a class that the witness does not know."""
-    return _OF_KIND.get(classes[name].attributes[0].partition(".")[0], -1) if name in classes else -1
+def groups_of(boxes: Boxes3D, classes: Mapping[str, ObjectClass]) -> NDArray[np.int64]:
+    """(N,) indices into GROUPS; -1 for a class that the witness does not know."""
+    kinds = {name: each.attributes[0].partition(".")[0] for name, each in classes.items()}
+    return np.array([_OF_KIND.get(kinds.get(name, ""), -1) for name in boxes.classes.tolist()], dtype=int)
 
 
 def projected(boxes: Boxes3D, camera_from_boxes: Array, camera: Camera) -> Array:
@@ -84,7 +86,7 @@ def unexplained(
 
     Arguments are those of `sightings`.
     """
-    groups, lonely = np.array([group_of(name, classes) for name in boxes.classes.tolist()], dtype=int), {}
+    groups, lonely = groups_of(boxes, classes), {}
     for name, in_image in seen.items():
         pose = frame.world_from_ego_at[name].matrix @ frame.rig[name].ego_from_camera
         kinds = np.array([_OF_COCO.get(kind, -1) for kind in in_image.classes.tolist()], dtype=int)
@@ -94,24 +96,18 @@ def unexplained(
     return lonely
 
 
-def sightings(
-    frame: Frame, boxes: Boxes3D, seen: Seen, classes: Mapping[str, ObjectClass]
-) -> tuple[Sightings, Sightings]:
+def sightings(frame: Frame, boxes: Boxes3D, seen: Seen, classes: Mapping[str, ObjectClass]) -> Sightings:
     """What is projected, and what is seen, in all images of a frame.
 
     boxes: those that are shown, world frame. seen: of the witness. classes: of the boxes, by name.
     """
-    groups = np.array([group_of(name, classes) for name in boxes.classes.tolist()], dtype=int)
+    groups = groups_of(boxes, classes)
     boxes, groups = boxes[groups >= 0], groups[groups >= 0]
     cameras = [camera for camera in frame.rig.cameras if camera.name in seen]
-    pairs = [_of_camera(frame, camera, boxes, groups, seen[camera.name]) for camera in cameras]
-    ours, theirs = zip((NOTHING, NOTHING), *pairs, strict=True)
-    return np.concatenate(ours), np.concatenate(theirs)
+    return np.concatenate([NOTHING, *(_of_camera(frame, one, boxes, groups, seen[one.name]) for one in cameras)])
 
 
-def _of_camera(
-    frame: Frame, camera: Camera, boxes: Boxes3D, groups: NDArray[np.int64], seen: Boxes2D
-) -> tuple[Sightings, Sightings]:
+def _of_camera(frame: Frame, camera: Camera, boxes: Boxes3D, groups: NDArray[np.int64], seen: Boxes2D) -> Sightings:
     pose, size = frame.world_from_ego_at[camera.name].matrix, np.array([camera.width, camera.height])
     whole = projected(boxes, inverse(pose @ camera.ego_from_camera), camera)
     inside = np.clip(whole, -0.5, np.tile(size, 2) - 0.5)
@@ -119,7 +115,7 @@ def _of_camera(
     boxes, groups, whole, inside = boxes[kept], groups[kept], whole[kept], inside[kept]
     distances = np.linalg.norm(boxes.centers - pose[:3, 3], axis=1)
     covered = intersections(inside, inside) / areas(inside)[:, None] * (distances[:, None] > distances + NEARER_M)
-    is_counted = (_heights(inside) >= LEAST_PX) & (areas(inside) >= IN_VIEW * areas(whole))
+    is_counted = (inside[:, 3] - inside[:, 1] >= LEAST_PX) & (areas(inside) >= IN_VIEW * areas(whole))
     is_counted &= covered.max(axis=1, initial=0) < HIDDEN
     scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
 
@@ -130,26 +126,24 @@ def _of_camera(
     corners, certainties, kinds = seen.corners[known][single], seen.scores[known][single], kinds[single]
     is_whole = np.concatenate([corners[:, :2] > EDGE_PX, corners[:, 2:] < size - 1 - EDGE_PX], axis=1).all(axis=1)
     rides = (kinds == 1) & (overlaps(corners, corners[kinds == 2]).max(axis=1, initial=0) > RIDER)
-    is_sure = (certainties >= SURE) & is_whole & (_heights(corners) >= LEAST_PX) & ~rides
+    is_sure = (certainties >= SURE) & is_whole & (corners[:, 3] - corners[:, 1] >= LEAST_PX) & ~rides
 
     table = overlaps(inside, corners) * (groups[:, None] == kinds)
     fits = _fits(table, boxes, (inside, corners), pose @ camera.ego_from_camera, camera)
     rows, columns = linear_sum_assignment(fits, maximize=True)
     is_pair = table[rows, columns] > 0
     rows, columns = rows[is_pair], columns[is_pair]
-    ours, theirs = np.zeros(len(inside), SIGHTING), np.zeros(len(corners), SIGHTING)
-    of_ours = inside, groups, distances, is_counted
     ground = np.linalg.norm(_feet(camera, camera.ego_from_camera, corners, np.zeros(1)), axis=1)
-    of_theirs = corners, kinds, ground, is_sure
-    for side, values in ((ours, of_ours), (theirs, of_theirs)):
-        side["camera"] = camera.name
-        for name, column in zip(("corners", "group", "distance", "counted"), values, strict=True):
-            side[name] = column
+    found = np.zeros(len(inside) + len(corners), SIGHTING)
+    found["camera"], found["is_seen"] = camera.name, np.arange(len(found)) >= len(inside)
+    found["corners"], found["group"] = np.concatenate([inside, corners]), np.concatenate([groups, kinds])
+    found["distance"], found["counted"] = np.concatenate([distances, ground]), np.concatenate([is_counted, is_sure])
+    ours, theirs = np.split(found, [len(inside)])  # views
     fit = fits[rows, columns]
     ours["overlap"][rows] = theirs["overlap"][columns] = table[rows, columns]
     ours["fit"][rows], theirs["fit"][columns] = fit, fit * scores[rows]
     ours["partner"][rows] = corners[columns]
-    return ours, theirs
+    return found
 
 
 def _fits(
@@ -178,7 +172,3 @@ def _feet(camera: Camera, frame_from_camera: Array, corners: Array, floor: Array
         steps = (floor - origin[2]) / rays[:, 2]
         places = origin[:2] + rays[:, :2] * np.where(steps > 0, steps, np.inf)[..., None]
     return np.nan_to_num(places, nan=np.inf, posinf=np.inf, neginf=-np.inf)
-
-
-def _heights(corners: Array) -> Array:
-    return np.asarray(corners[:, 3] - corners[:, 1])
