@@ -107,7 +107,7 @@ def test_drives_have_bytes_of_single_runs_and_a_bad_one_is_a_row(batch, fleet, m
 
 def test_drives_that_are_not_scored_have_their_agreement(batch, tmp_path, monkeypatch):
     found = SimpleNamespace(score=0.51234, low=0.4, high=None)
-    monkeypatch.setattr(worker_module, "agreement_of_run", lambda folder, drive: found)
+    monkeypatch.setattr(worker_module, "agreement_of_boxes", lambda folder, drive: found)
     batch()
     row = pq.read_table(tmp_path / "out/batch.parquet").to_pylist()[0]
     assert (row["agreement"], row["agreement_low"], row["agreement_high"]) == (0.5123, 0.4, None)
