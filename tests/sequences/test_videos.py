@@ -205,5 +205,5 @@ def test_a_video_without_images_is_one_line(tmp_path, capfd, damage):
         content = path.read_bytes()
         path.write_bytes(content[: content.index(b"mdat") + 8] if damage == "cut" else content[:8] + bytes(2000))
     with pytest.raises(InputError, match=r"v.mp4 cannot be opened as a video: it is cut short, has sound only"):
-        VideoReader(path).read(0)
+        open_sequence(path, fov_deg=70, height=1.4)
     assert "VIDEOIO" not in capfd.readouterr().err

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.ego_motion import EgoMotion, nearest
 from bevcli.parsing.documents import CSV_BYTES
@@ -162,14 +161,14 @@ def _first_in(folder: Path) -> Path | None:
 
 
 def size_of_first(drive: Path | None, camera: str) -> tuple[int, int] | None:
-    """(width, height) in pixels of a camera's first image; None where it has none that can be read."""
+    """(width, height) in pixels of a camera's first image; None where it has none, or none that states a size.
+
+    Raises InputError where the file cannot be read.
+    """
     images = {} if drive is None else first_images(drive)
     path = images.get(match_names([camera], images).get(camera, ""))
     if path is None:
         return None
-    try:
-        if path.suffix.lower() in VIDEO_SUFFIXES:
-            return size_of_video(path)
-        return size_of_image(read_bytes(path, LARGEST_IMAGE))
-    except InputError:
-        return None
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        return size_of_video(path)
+    return size_of_image(read_bytes(path, LARGEST_IMAGE))
