@@ -14,12 +14,11 @@ from bevcli.printing import say
 from bevcli.recording import RecordingOptions
 from bevcli.rig import CheckOptions
 from bevcli.sequences.format import formats
-from bevcli.sequences.options import InputOptions
+from bevcli.sequences.options import InputOptions, RigOptions
 from bevcli.viewer import ViewOptions
 from bevcli.writing import output_errors, write_whole
 
 PANEL = {"samples": "Start", "viz": "Look", "project-debug": "Look"}
-RIG = ("calibration", "extrinsics", "transform", "fov_deg", "height", "yaw_deg")
 ERRORS_FOUND = 3  # exit code of `bevcli project-debug`
 
 
@@ -102,12 +101,7 @@ def project_debug(
     source: Annotated[InputOptions, Part(only=("allow_outside",))],
     format_options: Annotated[
         FormatValues,
-        Part(
-            only=(
-                *(*RIG, "topics", "topics_file", "times", "image_rate_hz", "start_ns"),
-                *("ego_motion_file", "pose_times", "pose_angles", "poses_of"),
-            )
-        ),
+        Part(only=(*defaults(RigOptions), "topics", "topics_file", "times", "image_rate_hz", "start_ns")),
     ],
     options: CheckOptions,
     as_json: Json = False,

@@ -20,25 +20,23 @@ from bevcli.errors import SEVERITIES, Finding, InputError, errors_of
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import CameraRig
 from bevcli.model.config import training_rig_notes
-from bevcli.options import defaults, gather
+from bevcli.options import defaults
 from bevcli.printing import aligned, counted
 from bevcli.rig import drawings
 from bevcli.rig.coverage import Coverage, Measure, check_coverage, check_measures, coverage_of, measures_of
 from bevcli.rig.rig_checks import degrees_text, mounting_of, seen_fov_deg
 from bevcli.rig.sequence_checks import check_scenes, rig_findings
-from bevcli.sequences.files.calibration_file import CALIBRATION, RigDraft, draft_of, draft_rig
+from bevcli.sequences.files.calibration_file import CALIBRATION, OF_RIG, RigDraft, draft_of, draft_rig
 from bevcli.sequences.format import format_of, is_drive
 from bevcli.sequences.native import FolderOptions, NativeFolder
 from bevcli.sequences.native.folder import FolderDrive, read_frames_table
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import InputOptions, RigOptions
+from bevcli.sequences.options import InputOptions
 from bevcli.writing import write_whole
 
 OFFSET_WARNING_S = 0.1  # nuScenes' cameras are within 0.05 s of the frame
 OFFSET_ERROR_S = 0.5
 JITTER_WARNING_S = 0.05
-# Options that tell how the names of images and the poses are read.
-NAMES = {"times", "image_rate_hz", "start_ns", "ego_motion_file", "pose_times", "pose_angles", "poses_of"}
 
 
 WIDTH = 100
@@ -136,16 +134,16 @@ def check_calibration(
         InputError: the file is missing or not a JSON object, or the sequence has no such frame.
     """
     path, folder = Path(path), None if sequence is None else Path(sequence)
-    of_rig = {name: options[name] for name in defaults(RigOptions).keys() - NAMES if name in options}
+    own = FolderOptions(**{name: options[name] for name in defaults(FolderOptions) if name in options})
     if folder is None and is_drive(path):
-        beside = draft_of(gather(RigOptions, None, of_rig), path)
+        beside = draft_of(own, path)
         if beside is None and (_is_other_drive(path) or not (path / CALIBRATION).exists()):
             return _check_other_sequence(path, frame, options)
         if beside is not None and _is_other_drive(path):
             return _check_other_sequence(path, frame, options, () if beside.readings else beside.findings)
         draft, folder = beside or draft_rig(path / CALIBRATION, path), path
     else:
-        draft = draft_rig(path, folder, **of_rig)
+        draft = draft_rig(path, folder, **{name: options[name] for name in ("calibration", *OF_RIG) if name in options})
     if folder is None:
         draft = draft.certain()
     elif _is_other_drive(folder):
@@ -154,7 +152,7 @@ def check_calibration(
     of_drive: tuple[Finding, ...] = ()
     images: Mapping[str, NDArray[np.uint8]] = {}
     if folder is not None and draft.rig.cameras:
-        draft, of_drive, images = _read_folder(folder, draft, frame, options)
+        draft, of_drive, images = _read_folder(folder, draft, frame, own, outside=bool(options.get("allow_outside")))
     name = os.path.basename(os.path.realpath(folder or (path if path.is_dir() else path.with_suffix(""))))
     return check_rig(draft.rig, draft.findings, name, images).with_findings(of_drive)
 
@@ -186,20 +184,18 @@ def _check_other_sequence(
 
 
 def _read_folder(
-    folder: Path, draft: RigDraft, frame: int, options_given: Mapping[str, Any]
+    folder: Path, draft: RigDraft, frame: int, own: FolderOptions, *, outside: bool
 ) -> tuple[RigDraft, tuple[Finding, ...], Mapping[str, NDArray[np.uint8]]]:
     """The rig as the images show it, the findings about a native folder, and the images by camera of one frame."""
     findings: list[Finding] = []
-    outside = bool(options_given.get("allow_outside"))
-    native = FolderOptions(**{name: options_given[name] for name in NAMES & options_given.keys()})
     options = InputOptions(ego_motion="optional", ground_truth=False, allow_outside=outside)
     try:
-        sequence = FolderDrive(folder, options, native, draft)
+        sequence = FolderDrive(folder, options, own, draft)
     except InputError as error:
         findings.append(_refused(error))
         try:
             # Images may be readable without ego-motion.
-            sequence = FolderDrive(folder, replace(options, ego_motion="static"), native, replace(draft, readings=()))
+            sequence = FolderDrive(folder, replace(options, ego_motion="static"), own, replace(draft, readings=()))
         except InputError:
             return draft, tuple(findings), {}
     draft = sequence.draft

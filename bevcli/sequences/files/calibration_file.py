@@ -28,7 +28,18 @@ FORMAT, CALIBRATION = "bevcli-calibration/1", "calibration.json"
 LARGEST_BYTES = 4 << 20
 LARGEST_JSON = 64 << 20  # of another program, such as that of a reconstruction
 CONTRADICTED = "images-contradict"  # code of a finding about what the user states
-RIG_STATEMENTS = ("transform", "rig_axes", "camera_axes", "rig_angles", "rig_unit")  # options of what transforms are
+# Options of a rig, beside its calibration.
+OF_RIG = (
+    "extrinsics",
+    "fov_deg",
+    "height",
+    "yaw_deg",
+    "transform",
+    "rig_axes",
+    "camera_axes",
+    "rig_angles",
+    "rig_unit",
+)
 KEYS = ("width", "height", "intrinsics", "distortion", "ego_from_camera")
 LONGEST_NAME = 60  # characters of a wrong name in a message
 LARGEST_SIZE = 16384  # pixels of a side
@@ -112,8 +123,7 @@ def draft_of(options: RigOptions, drive: Path | None = None) -> RigDraft | None:
         raise InputError(
             "`calibration` (`--calibration`) and `intrinsics` (`--intrinsics`) are the same: pass one of them"
         )
-    names = ("extrinsics", "fov_deg", "height", "yaw_deg", *RIG_STATEMENTS)
-    how = {name: value for name in names if (value := getattr(options, name)) is not None}
+    how = {name: value for name in OF_RIG if (value := getattr(options, name)) is not None}
     path = options.intrinsics if options.calibration is None else options.calibration
     return None if path is None and not how else draft_rig(path, drive, **how).checked(path or Path())
 

@@ -47,10 +47,7 @@ def batch(
     run_options: Annotated[RunOptions, Part(without=("save_bev", "score_without_labels"))],
     recording: Annotated[RecordingOptions, Part(without=("probes", "vehicle_mesh"))],
     source: Annotated[InputOptions, Part(without=("scene",))],
-    format_options: Annotated[
-        FormatValues,
-        Part(without=("intrinsics", "extrinsics", "ego_motion_file", "pose_times", "pose_angles", "poses_of")),
-    ],
+    format_options: Annotated[FormatValues, Part(without=("intrinsics", "extrinsics", "ego_motion_file"))],
 ) -> None:
     """Run BEVFormer on many DRIVES, each exactly as `bevcli run` does, on this machine or a Ray cluster.
 
