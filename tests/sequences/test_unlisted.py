@@ -431,3 +431,57 @@ def test_a_mistake_in_a_drive_of_kitti_is_one_line(tmp_path):
         open_sequence(drive)
     yaws = {"image_02": 0, "image_03": 0}
     assert open_sequence(drive, fov_deg=65, height=1.65, yaw_deg=yaws, ego_motion="static").rig
+
+
+def test_kitti_360_as_it_lies_on_disk(tmp_path):
+    """Poses of some frames, by their numbers, of an IMU 0.6 m above the road with x forward, y right, z down."""
+    truth = open_sequence(STREET, ground_truth=False)
+    drive, name = tmp_path / "data_2d_raw/2013_05_28_drive_0000_sync", "image_00"
+    camera, times = truth.rig["CAM_FRONT"], [stamp.timestamp_ns for stamp in truth.stamps[:8]]
+    (drive / name / "data_rect").mkdir(parents=True)
+    for number in range(8):
+        shutil.copy(STREET / f"images/CAM_FRONT/{number:06d}.jpg", drive / name / f"data_rect/{number:010d}.jpg")
+    (drive / name / "timestamps.txt").write_text("\n".join(f"{time / 1e9:.9f}" for time in times))
+    ego_from_imu = rigid((0, 0, 0.6), np.diag([1.0, -1, -1]))
+    rectified = rotation_about_z(0.02)
+    numbers = {
+        "calibration/perspective.txt": [
+            f"S_rect_00: {camera.width} {camera.height}",
+            f"R_rect_00: {text_of(rectified)}",
+            f"P_rect_00: {text_of(np.column_stack([camera.intrinsics, np.zeros(3)]))}",
+        ],
+        "calibration/calib_cam_to_pose.txt": [
+            f"{name}: {text_of((np.linalg.inv(ego_from_imu) @ camera.ego_from_camera @ rigid(rotation=rectified))[:3])}"
+        ],
+        f"data_poses/{drive.name}/poses.txt": [
+            f"{number} {text_of((truth.ego_motion.pose_at(times[number]).matrix @ ego_from_imu)[:3])}"
+            for number in range(1, 8)  # the first frame has none
+        ],
+    }
+    for path, lines in numbers.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text("\n".join(lines))
+    found = open_sequence(drive, rate_hz="all")
+    np.testing.assert_allclose(found.rig[name].ego_from_camera[:3, :3], camera.ego_from_camera[:3, :3], atol=1e-6)
+    assert found.rig[name].ego_from_camera[2, 3] == pytest.approx(camera.ego_from_camera[2, 3], abs=0.05)
+    times = [stamp.timestamp_ns for stamp in found.stamps]
+    assert times == pytest.approx([stamp.timestamp_ns for stamp in truth.stamps[1:8]], abs=1000)
+    ways = [np.linalg.norm(np.diff([drive.ego_motion.pose_at(time).translation for time in times], axis=0), axis=1)
+            for drive in (found, truth)]  # fmt: skip
+    np.testing.assert_allclose(*ways, atol=0.02)
+
+
+def text_of(matrix):
+    return " ".join(f"{number:.9e}" for number in np.ravel(matrix))
+
+
+def test_a_calibration_of_kitti_tracking_has_no_colons(tmp_path):
+    drive = images_of(tmp_path, "image_2")
+    rows = {"P2": np.column_stack([FACTS["CAM_FRONT"]["intrinsics"], np.zeros(3)]), "R_rect": np.eye(3)}
+    rows["Tr_velo_cam"] = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
+    text = [f"P2: {text_of(rows.pop('P2'))}", *(f"{name} {text_of(row)}" for name, row in rows.items())]
+    (tmp_path / "calib/0000.txt").parent.mkdir()
+    (tmp_path / "calib/0000.txt").write_text("\n".join(text))
+    how = {"calibration": tmp_path / "calib/0000.txt", "image_rate_hz": 10, "ego_motion": "static"}
+    place = open_sequence(drive, **how).rig["image_2"].ego_from_camera[:3, 3]
+    np.testing.assert_allclose(place, (0.76 + 0.27, 0, 1.73 - 0.08), atol=1e-9)  # of the Velodyne, and of the camera

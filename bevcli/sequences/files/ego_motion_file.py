@@ -41,6 +41,7 @@ class DrivePoses:
     stated: RigOptions  # `pose_times`, `pose_angles` and `poses_of`, each None where it is to be found
     times_ns: NDArray[np.int64] | None = None  # (F,) of its frames; None while they are not known
     rig_is_open: bool = False  # the poses of its cameras are one of several readings
+    numbers: NDArray[np.int64] | None = None  # (F,) of its frames, as times_ns
 
     @property
     def cameras_ahead(self) -> list[Camera]:

@@ -7,11 +7,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.options import named
 from bevcli.parsing.documents import read_csv
@@ -63,7 +63,7 @@ class FolderDrive(ListedDrive):
                 without = f"{named(FolderOptions, name)} would have no effect"
                 raise InputError(f"{table}: states the times of all images, and {without}: remove the option")
         is_open = bool(draft.readings)
-        poses = _poses_without_frames(file, common.ego_motion, DrivePoses(rig, own, _times_of(entries), is_open))
+        poses = _poses_without_frames(file, common.ego_motion, _drive_poses(rig, own, entries, is_open))
         self.understood, left_out, advice = "", "", "add ego-motion, or remove the frame"
         if not entries:
             from bevcli.workshop.formats import matching, unlisted
@@ -73,7 +73,7 @@ class FolderDrive(ListedDrive):
                 rig = replace(rig, cameras=tuple(camera for camera in rig.cameras if camera.name in used))
             motion, has_poses = (None, True) if poses is None else (poses.motion, poses.motion is not None)
             frames = unlisted.find_frames(path, rig.names, own, motion, has_poses=has_poses)
-            poses = poses or _read_poses(file, common.ego_motion, DrivePoses(rig, own, _times_of(frames[0]), is_open))
+            poses = poses or _read_poses(file, common.ego_motion, _drive_poses(rig, own, frames[0], is_open))
             entries, self.understood = frames if poses.motion is None else matching.covered(frames, poses.motion)
             advice = "state the time of the first image by `start_ns` (`--start-ns`), or in timing.toml"
         assert poses is not None
@@ -182,9 +182,12 @@ def _read_poses(file: Path, use: EgoMotionUse, drive: DrivePoses) -> ReadPoses:
     return read_poses(file, drive)
 
 
-def _times_of(entries: tuple[FrameEntry, ...]) -> NDArray[np.int64] | None:
-    """The times of frames; None without frames."""
-    return np.array([entry.stamp.timestamp_ns for entry in entries], dtype=np.int64) if entries else None
+def _drive_poses(rig: CameraRig, own: RigOptions, entries: tuple[FrameEntry, ...], is_open: bool) -> DrivePoses:
+    """What poses are for; without times as long as there are no frames."""
+    times, numbers = (
+        np.array([(each.stamp.timestamp_ns, each.stamp.index) for each in entries], np.int64).reshape(-1, 2).T
+    )
+    return DrivePoses(rig, own, times, is_open, numbers) if entries else DrivePoses(rig, own, None, is_open)
 
 
 def check_covered(file: Path, poses: ReadPoses, entries: tuple[FrameEntry, ...], advice: str) -> None:

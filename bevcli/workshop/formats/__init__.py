@@ -125,7 +125,7 @@ class T4Dataset(Format):
 
 @options("Input")
 class KittiDrive(FolderOptions, Format):
-    """A drive of KITTI odometry or KITTI raw."""
+    """A drive of KITTI odometry, KITTI raw or KITTI-360."""
 
     name = "a KITTI drive"
     expected = "image_2 and calib.txt, or image_02/data"
@@ -136,7 +136,7 @@ class KittiDrive(FolderOptions, Format):
         """True for a folder with KITTI's folders of images, unless it has a file of a sequence folder."""
         if not path.is_dir() or any((path / name).exists() for name in NATIVE_FILES):
             return False
-        if any((path / f"image_0{number}/data").is_dir() for number in range(4)):
+        if any((path / f"image_0{number}" / name).is_dir() for number in range(4) for name in ("data", "data_rect")):
             return True
         has_images = any((path / f"image_{number}").is_dir() for number in range(4))
         return has_images and ((path / "calib.txt").exists() or (path / "times.txt").exists())

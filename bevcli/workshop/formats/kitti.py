@@ -35,7 +35,8 @@ from bevcli.workshop.formats.pose_readings import product, quaternions_of_angles
 from bevcli.workshop.formats.pose_table import number_of
 from bevcli.writing import write_whole
 
-KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt")
+KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt", "perspective.txt")  # the last one of KITTI-360
+CAMERAS_TO_POSE = "calib_cam_to_pose.txt"  # of KITTI-360, beside it
 # The Velodyne is 0.76 m ahead of the rear axle and 1.73 m above the road (the data set's drawing of the vehicle).
 EGO_FROM_VELODYNE = rigid((0.76, 0.0, 1.73))
 OXTS_NUMBERS = 30  # of a file: latitude, longitude, altitude, roll, pitch, yaw and so on
@@ -234,7 +235,9 @@ def _calibration(camera: Camera, ego_from_bev: Array) -> str:
 
 def open_kitti(path: Path, common: InputOptions, options: FolderOptions) -> FolderDrive:
     """A drive of KITTI as a `Drive`. Raises InputError."""
-    files = [folder / name for folder in (path, path.resolve().parent) for name in KITTI_FILES]
+    drive = path.resolve()
+    root = drive.parent.parent  # of KITTI-360
+    files = [folder / name for folder in (path, drive.parent, root / "calibration") for name in KITTI_FILES]
     if options.calibration is None and options.intrinsics is None and options.fov_deg is None:
         calibration = next((file for file in files if is_there(file)), None)
         if calibration is None:
@@ -244,9 +247,8 @@ def open_kitti(path: Path, common: InputOptions, options: FolderOptions) -> Fold
             )
         options = replace(options, calibration=calibration)
     if options.ego_motion_file is None:
-        drive = path.resolve()
-        beside = drive.parent.parent / f"poses/{drive.name}.txt"
-        poses = (path / "poses.txt", path / f"{drive.name}.txt", beside, path / "oxts")
+        beside = (root / f"poses/{drive.name}.txt", root / f"data_poses/{drive.name}/poses.txt")
+        poses = (path / "poses.txt", path / f"{drive.name}.txt", *beside, path / "oxts")
         options = replace(options, ego_motion_file=next((file for file in poses if is_there(file)), None))
     return FolderDrive(path, common, options)
 
@@ -254,15 +256,17 @@ def open_kitti(path: Path, common: InputOptions, options: FolderOptions) -> Fold
 def read_kitti(path: Path) -> Cameras | None:
     """The rectified cameras of KITTI: image_02 of calib_cam_to_cam.txt, image_2 of P2 in other files; None for others.
 
-    The origin is on the road, below the rear axle. Poses need Tr_velo_to_cam, Tr, or calib_velo_to_cam.txt beside.
+    The origin is on the road, below the rear axle. Poses need Tr_velo_to_cam, Tr, or calib_velo_to_cam.txt beside. In
+    KITTI-360 they are in calib_cam_to_pose.txt beside, with the origin at its GPS and IMU.
     """
     file = next((path / name for name in KITTI_FILES if (path / name).exists()), path)
     if file.suffix != ".txt":
         return None
     rows = _kitti_rows(file)
     camera0_from_velodyne = _camera0_from_velodyne(rows, file)
-    rectification = next((_row(rows, key, 9, file) for key in ("R_rect_00", "R0_rect", "R_rect") if key in rows), None)
-    rectified_from_camera0 = rigid(rotation=None if rectification is None else rectification.reshape(3, 3))
+    rectified_from_camera0 = _rectification(rows, ("R_rect_00", "R0_rect", "R_rect"), file)
+    beside = file.with_name(CAMERAS_TO_POSE)
+    on_body = _kitti_rows(beside) if file.name == KITTI_FILES[-1] and is_there(beside) else {}
     cameras: Cameras = {}
     for key in rows:
         if (match := re.fullmatch(r"P(_rect_0)?(\d)", key)) is None:
@@ -276,8 +280,13 @@ def read_kitti(path: Path) -> Cameras | None:
             camera_from_rectified = rigid(np.linalg.solve(matrix, projection[:, 3]))
             camera_from_velodyne = camera_from_rectified @ rectified_from_camera0 @ camera0_from_velodyne
             pose = StatedPose({"": EGO_FROM_VELODYNE @ inverse(camera_from_velodyne)}, "ego_from_camera", exact=True)
-        size = f"S_rect_0{match[2]}"
-        cameras[f"image_{'0' if match[1] else ''}{match[2]}"] = StatedCamera(
+        name, size = f"image_{'0' if match[1] else ''}{match[2]}", f"S_rect_0{match[2]}"
+        if name in on_body:
+            rectified_from_camera = _rectification(rows, (f"R_rect_0{match[2]}",), file)
+            body_from_camera = _row(on_body, name, 12, beside).reshape(3, 4)
+            matrix_on_body = rigid(body_from_camera[:, 3], body_from_camera[:, :3]) @ inverse(rectified_from_camera)
+            pose = StatedPose({"": matrix_on_body}, "ego_from_camera", axes="optical", name=CAMERAS_TO_POSE)
+        cameras[name] = StatedCamera(
             (matrix / matrix[2, 2]).tolist(),
             (rows[size][0], rows[size][-1]) if size in rows else None,
             {"model": "none"},
@@ -286,6 +295,12 @@ def read_kitti(path: Path) -> Cameras | None:
     if not cameras:
         raise InputError(f"{file}: has no projection matrix (expected P2, or P_rect_02, of KITTI)")
     return cameras
+
+
+def _rectification(rows: Mapping[str, Array], names: tuple[str, ...], file: Path) -> Array:
+    """(4, 4) rectified_from_camera of the first of these rows; the identity without one."""
+    row = next((_row(rows, name, 9, file) for name in names if name in rows), None)
+    return rigid(rotation=None if row is None else row.reshape(3, 3))
 
 
 def _camera0_from_velodyne(rows: Mapping[str, Array], file: Path) -> Array | None:
@@ -309,9 +324,9 @@ def _rigid_of(path: Path) -> Array:
 def _kitti_rows(path: Path) -> dict[str, Array]:
     rows = {}
     for number, line in lines_of(path):
-        key, colon, text = line.partition(":")
+        key, _, text = line.partition(":") if ":" in line else line.partition(" ")  # tracking has no colons
         numbers = [number_of(word) for word in text.split()]
-        if not colon:
+        if not numbers:
             raise InputError(f"{path}: line {number}: expected NAME: NUMBERS, as in KITTI")
         if numbers and None not in numbers:
             if key.strip() in rows:

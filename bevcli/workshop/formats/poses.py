@@ -60,6 +60,7 @@ _DIGITS = re.compile(r"\d{1,18}(?:\.\d{0,18})?", re.ASCII)  # a time with all of
 POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
 ANGLES = ("vector", "radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # those of feet are stated
+LARGEST_NUMBER = 10**7  # of a frame
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 
 
@@ -75,8 +76,10 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     if table is None or not name:
         return None
     table = in_usual_units(table, drive.stated)
+    numbered = _of_numbered_frames(table, drive)
+    table = table if numbered is None else numbered[0]
     positions, origin = _positions(table)
-    times, time_words = _times(table, positions, drive)
+    times, time_words = _times(table, positions, drive) if numbered is None else numbered[1:]
     table = with_course(table, positions, times)
     late = np.diff(times) <= 0
     if late.any():
@@ -174,6 +177,23 @@ def _times(table: Table, positions: Array, drive: DrivePoses) -> tuple[NDArray[n
     if np.abs(times).max() > LARGEST_INTEGER:
         raise InputError(f"{table.path}: the times are too large for {WORDS[unit]}: pass `pose_times` (`--pose-times`)")
     return times, WORDS[unit] + (" since 1970" if SINCE_1970_NS[0] <= times[0] <= SINCE_1970_NS[1] else "")
+
+
+def _of_numbered_frames(table: Table, drive: DrivePoses) -> tuple[Table, NDArray[np.int64], str] | None:
+    """The rows of frames, their times and words, where each row begins with the number of a frame, as in KITTI-360."""
+    if not table.has("time", *MATRIX) or table.columns["time"] or drive.stated.pose_times is not None:
+        return None
+    numbers = np.fromiter(map(float, _exact(table)), np.float64, len(table))
+    if (numbers % 1).any() or numbers.max() > LARGEST_NUMBER:
+        return None
+    if drive.times_ns is None:
+        raise FrameTimesNeeded(f"{table.path}: its rows may begin with the numbers of frames")
+    if drive.numbers is None or 2 * np.isin(drive.numbers, numbers).sum() < len(drive.numbers):
+        return None
+    time_of = dict(zip(drive.numbers.tolist(), drive.times_ns.tolist(), strict=True))
+    known = np.isin(numbers, drive.numbers)
+    times = np.array([time_of[number] for number in numbers[known].tolist()], dtype=np.int64)
+    return replace(table, spans=table.spans[known]), times, "with the numbers of the frames"
 
 
 def _both(table: Table, seconds: str) -> NDArray[np.int64]:
