@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -109,3 +110,31 @@ def test_poses_that_would_fit_much_better_otherwise_are_refused(change, stated, 
     with pytest.raises(InputError, match=told):
         opened(tmp_path, options, **stated)
     opened(tmp_path, options, image_check=False, pose_axes="flu", pose_transform="world_from_body", rig_unit="m")
+
+
+def answered(folder, options, **stated):
+    """The drives that all answers to the questions of a drive lead to."""
+    try:
+        return [opened(folder, options, **stated)]
+    except InputError as asked:
+        question = asked
+    answers = choices_of(question)
+    assert answers, f"{question} names no option that decides ({stated})"
+    assert all(answer.keys() - stated.keys() for answer in answers), f"{question} asks again ({stated})"
+    return [found for answer in answers for found in answered(folder, options, **stated, **answer)]
+
+
+@pytest.mark.parametrize("convention", [
+    pytest.param(Convention(rig_axes="frd", body="frd", origin_m=0.55), marks=pytest.mark.slow),
+    Convention(transform="T", unit="cm", file="yaw"),
+    pytest.param(Convention(rig_axes="rfu", body="camera", pose_transform="body_from_world"), marks=pytest.mark.slow),
+])  # fmt: skip
+def test_at_night_each_answer_goes_on_and_one_is_right(convention, street, tmp_path):
+    options = write(street, tmp_path, convention)
+    black = cv2.imencode(".jpg", np.zeros((450, 800, 3), np.uint8))[1].tobytes()
+    for path in (tmp_path / "drive/images").rglob("*.jpg"):
+        path.write_bytes(black)
+    with pytest.raises(InputError, match="they show too little"):
+        opened(tmp_path, options)
+    results = [wrong(found, street) for found in answered(tmp_path, options)]
+    assert results.count("") >= 1
