@@ -410,7 +410,7 @@ def test_a_folder_of_drives_gives_all_of_them(tmp_path):
     assert [drive.source for drive in drives][1:] == [f"{tmp_path}/{log}" for log in ("train/a", "val/a", "val/b")]
     with pytest.raises(InputError, match=r"is a folder of 4 drives \(000150, train/a, val/a, b\): choose one with `sc"):
         open_sequence(tmp_path)
-    with pytest.raises(InputError, match=f'{tmp_path}/000150/scene_12.json: "data" is missing'):
+    with pytest.raises(InputError, match=r"000150/scene_12\.json: object missing required field `data`"):
         open_sequence(tmp_path, scene="000150")
 
 
