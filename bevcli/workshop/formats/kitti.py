@@ -28,7 +28,7 @@ from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import ExportOptions, LabelOptions
 from bevcli.workshop.formats.camera_poses import Cameras, StatedCamera, StatedPose
-from bevcli.workshop.formats.label_format import LARGEST_RADIANS, LabelledFrame, Labels
+from bevcli.workshop.formats.label_readings import LARGEST_RADIANS, USUAL, LabelledFrame, Labels
 from bevcli.workshop.formats.name_times import read_times
 from bevcli.workshop.formats.other_calibrations import lines_of
 from bevcli.workshop.formats.pose_readings import product, quaternions_of_angles, rotated
@@ -65,9 +65,7 @@ def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labe
         f"the boxes are those that {name} sees, in its frame (`labels_camera` (`--labels-camera`)); others have no "
         "labels"
     )
-    states = {"labels_frame": "ego", "labels_sides": "lwh", "labels_z": "center", "labels_yaw": "x"}
-    states["labels_yaw_unit"] = "radians"
-    return Labels(states, tuple(frames), lists_empty=path.is_dir(), notes=(note,))
+    return Labels(USUAL, tuple(frames), lists_empty=path.is_dir(), notes=(note,))
 
 
 def _looking_ahead(rig: CameraRig) -> str:
@@ -310,9 +308,7 @@ def _camera0_from_velodyne(rows: Mapping[str, Array], file: Path) -> Array | Non
         matrix = _row(rows, name, 12, file).reshape(3, 4)
         return rigid(matrix[:, 3], matrix[:, :3])
     beside = file.parent / "calib_velo_to_cam.txt"
-    if not beside.exists():
-        return None
-    return _rigid_of(beside)
+    return _rigid_of(beside) if beside.exists() else None
 
 
 def _rigid_of(path: Path) -> Array:
@@ -328,7 +324,7 @@ def _kitti_rows(path: Path) -> dict[str, Array]:
         numbers = [number_of(word) for word in text.split()]
         if not numbers:
             raise InputError(f"{path}: line {number}: expected NAME: NUMBERS, as in KITTI")
-        if numbers and None not in numbers:
+        if None not in numbers:
             if key.strip() in rows:
                 raise InputError(f"{path}: line {number}: {key.strip():.60} is in the file twice: keep one")
             rows[key.strip()] = np.array(numbers, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""What a table of labels holds, decided by its boxes: the sizes of their classes, the road, and the motion.
+"""The contents of a file of labels, and what they are, decided by the boxes: sizes of classes, the road, the motion.
 
 What stands stays where it is in the world, boxes stand on the road, and vehicles drive ahead.
 """
@@ -25,6 +25,9 @@ SIZES = {
 }  # fmt: skip
 SIDES = {"l": "length", "w": "width", "h": "height"}
 FRAMES = ("ego", "world", "bev")
+USUAL = {  # what a file holds, as options and their values; the same as in bevcli
+    "labels_frame": "ego", "labels_sides": "lwh", "labels_z": "center", "labels_yaw": "x", "labels_yaw_unit": "radians",
+}  # fmt: skip
 YAWS = {  # -> in words; sign and offset that make it counter-clockwise from x, radians
     "x": ("counter-clockwise from x", 1, 0.0), "y": ("counter-clockwise from y", 1, np.pi / 2),
     "clockwise": ("clockwise from x", -1, 0.0), "compass": ("clockwise from y", -1, np.pi / 2),
@@ -32,17 +35,44 @@ YAWS = {  # -> in words; sign and offset that make it counter-clockwise from x, 
 }  # fmt: skip
 SOUND_PERCENT, SOUND_M, SOUND_DEG = 22.0, 0.35, 15.0  # largest residuals of an unusual reading that is taken
 UNFIT = 2.5  # times these: the usual one is refused
-CLEAR, CLEAR_SOUND = (
-    2.0,
-    0.3,
-)  # factor, and addition as a share of these, by which the residuals of all others are larger
+CLEAR, CLEAR_SOUND = 2.0, 0.3  # factor, and addition as a share of these, by which all other residuals are larger
 FEWEST = 5  # boxes that tell
-LARGEST_TURN = 6.5  # radians; larger yaws are usually in degrees
+LARGEST_RADIANS, LARGEST_DEGREES = 6.5, 361.0  # a little more than a turn
+LONGEST_M, USUAL_M = 300.0, 30.0  # of the longest box, and of the median one; a train has 200 m
+IN_CENTIMETRES = 1000.0  # a smaller median is that of boxes in centimetres
 LONG_M = 1.7  # of classes that drive ahead
 NEAR_M, FAR_M = 40.0, 300.0  # of boxes that tell the road; of boxes that are not around the vehicle
 WAY_M, DRIVEN_M = 1.0, (0.5, 8.0)  # between two frames: of the vehicle, of driving objects
 STANDING_SHARE = 30  # percentage of the boxes that stand
 ALLOWED_M = 0.5  # by which standing boxes move, and by which boxes leave the plane of the road
+
+
+@dataclass(frozen=True)
+class LabelledFrame:
+    """The boxes of one frame."""
+
+    index: int | None  # of the frame; None if the file has times only
+    timestamp_ns: int | None  # of the frame; None if the file has indices only
+    boxes: Boxes3D  # in the frame of reference of the file
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The contents of a file of labels.
+
+    Attributes:
+        states: options that state what the file holds, and their values, such as {"labels_frame": "world"}; the boxes
+            decide on others.
+        frames: in the order of the file.
+        lists_empty: frames without boxes are in the file, too. If not, a frame of the drive that the file does not
+            have may be empty or not labelled.
+        notes: what was assumed, for the user.
+    """
+
+    states: Mapping[str, str]
+    frames: tuple[LabelledFrame, ...]
+    lists_empty: bool
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,11 +114,29 @@ class PlacedBoxes:
 
 def read_as(states: Mapping[str, str], boxes: Boxes3D) -> Boxes3D:
     """The boxes of a file with sizes, centres and yaws as bevcli has them, in the file's frame of reference."""
-    sizes = boxes.sizes_lwh[:, [states.get("labels_sides", "lwh").index(letter) for letter in "lwh"]]
-    half = sizes * (0, 0, 0.5) if states.get("labels_z") == "bottom" else np.zeros((1, 3))
-    _, sign, offset = YAWS[states.get("labels_yaw", "x")]
-    yaws = np.radians(boxes.yaws) if states.get("labels_yaw_unit") == "degrees" else boxes.yaws
+    states = {**USUAL, **states}
+    sizes = boxes.sizes_lwh[:, [states["labels_sides"].index(letter) for letter in "lwh"]]
+    half = sizes * (0, 0, 0.5 if states["labels_z"] == "bottom" else 0)
+    _, sign, offset = YAWS[states["labels_yaw"]]
+    yaws = np.radians(boxes.yaws) if states["labels_yaw_unit"] == "degrees" else boxes.yaws
     return replace(boxes, sizes_lwh=sizes, centers=boxes.centers + half, yaws=wrap_angle(sign * yaws + offset))
+
+
+def check_labels(path: Path, labels: Labels) -> None:
+    """Raise InputError for impossible boxes."""
+    boxes = Boxes3D.concatenate([labelled.boxes for labelled in labels.frames])
+    if not len(boxes):
+        return
+    longest = boxes.sizes_lwh.max(axis=1)
+    if longest.max() > LONGEST_M or np.median(longest) > USUAL_M:
+        unit = "centimetres" if np.median(longest) < IN_CENTIMETRES else "millimetres"
+        raise InputError(
+            f"{path}: has boxes of {longest.max():.0f} m, the median is {np.median(longest):.0f} m (in {unit}?): "
+            "convert x, y, z, length, width and height to metres"
+        )
+    largest = float(np.abs(boxes.yaws).max())
+    if largest > LARGEST_DEGREES:
+        raise InputError(f"{path}: has a yaw of {largest:g} (expected radians, or degrees up to 360): correct it")
 
 
 def decide(
@@ -199,7 +247,7 @@ def _places(frames: Sequence[PlacedBoxes], states: Mapping[str, str]) -> Iterato
 
 def _yaws(frames: Sequence[PlacedBoxes], states: Mapping[str, str]) -> Iterator[LabelReading]:
     """Meanings of yaw: vehicles drive ahead."""
-    units = ["degrees", "radians"] if _largest_yaw(frames) > LARGEST_TURN else ["radians", "degrees"]
+    units = ["degrees", "radians"] if _largest_yaw(frames) > LARGEST_RADIANS else ["radians", "degrees"]
     for unit, name in product(units, YAWS):
         reading = {"labels_yaw": name, "labels_yaw_unit": unit}
         off = []

@@ -27,16 +27,8 @@ from bevcli.sequences.files.boxes_file import count_classes
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
-from bevcli.workshop.formats.label_format import LabelledFrame, Labels, Moment, check_labels
-from bevcli.workshop.formats.label_readings import PlacedBoxes, decide
+from bevcli.workshop.formats.label_readings import USUAL, LabelledFrame, Labels, PlacedBoxes, check_labels, decide
 
-STATING = (
-    "labels_frame",
-    "labels_sides",
-    "labels_z",
-    "labels_yaw",
-    "labels_yaw_unit",
-)  # options that state what a table holds
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
 
@@ -145,7 +137,7 @@ def _in_world(
         ego = frame.world_from_ego.matrix
         world_from = {"ego": ego, "bev": ego @ frame.rig.ego_from_bev, "world": np.eye(4)}
         placed[index] = PlacedBoxes(frame.stamp.scene, labelled.boxes, world_from)
-    stated = {name: value for name in STATING if (value := getattr(options, name)) is not None}
+    stated = {name: value for name in USUAL if (value := getattr(options, name)) is not None}
     stated = {**labels.states, **stated}
     if stated.get("labels_frame") == "world" and not sequence.has_ego_motion:
         raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
@@ -274,9 +266,9 @@ def _check_columns(path: Path, columns: list[str]) -> None:
         raise InputError(f"{path}: two columns have one name (found {', '.join(columns)})")
 
 
-def _moments(path: Path, rows: list[CsvRow]) -> dict[Moment, list[int]]:
+def _moments(path: Path, rows: list[CsvRow]) -> dict[tuple[int | None, int | None], list[int]]:
     """Index and time of each frame -> the numbers of its rows."""
-    moments: dict[Moment, list[int]] = {}
+    moments: dict[tuple[int | None, int | None], list[int]] = {}
     for number, row in enumerate(rows):
         index, time = (row.integer(name) if row.cells[name] else None for name in ("frame", "timestamp_ns"))
         if index is None and time is None:

@@ -238,11 +238,8 @@ def _with_fix(table: Table) -> Table:
     lost = int((~fixes).sum())
     if not fixes.any():
         raise InputError(f"{table.path}: no row has a fix: measure the motion by `odometry=True` (`--odometry`)")
-    return (
-        replace(table, spans=table.spans[fixes], notes=(*table.notes, f"{lost} without a fix left out"))
-        if lost
-        else table
-    )
+    notes = (f"{lost} without a fix left out",) if lost else ()
+    return replace(table, spans=table.spans[fixes], notes=(*table.notes, *notes))
 
 
 def _has_fix(row: CsvRow) -> bool:
