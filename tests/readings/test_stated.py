@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stated_mistakes import motion_of
+from stated_mistakes import about_z, motion_of
 
 from bevcli.sequences.open import open_sequence, select
 from bevcli.workshop.odometry.compare import chosen_frames
@@ -25,42 +25,42 @@ def street():
     return some, judged._pairs, drive.ego_motion
 
 
-def changed(motion, positions=None, rotations=None):
-    kept = Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1))
-    at = motion.translations if positions is None else positions
-    return motion_of(motion.timestamps_ns, at, kept if rotations is None else rotations)
+def changed(motion, change):
+    return motion_of(
+        motion.timestamps_ns, *change(motion.translations, Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1)))
+    )
 
 
-def with_axes(motion, axes):
+def with_axes(axes):
     """Poses whose world and vehicle have other axes."""
-    rotations = Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1)).as_matrix()
-    return changed(motion, motion.translations @ axes.T, Rotation.from_matrix(axes @ rotations @ axes.T))
+    return lambda at, turned: (at @ axes.T, Rotation.from_matrix(axes @ turned.as_matrix() @ axes.T))
 
 
-def with_yaws(motion, changed_yaw):
-    x, y, _ = Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1)).apply([1, 0, 0]).T
-    yaws = changed_yaw(np.unwrap(np.arctan2(y, x)))
-    return changed(motion, rotations=Rotation.from_rotvec(np.multiply.outer(yaws, (0, 0, 1))))
+def with_yaws(change):
+    def change_yaws(at, turned):
+        x, y, _ = turned.apply([1, 0, 0]).T
+        return at, about_z(change(np.unwrap(np.arctan2(y, x))))
+
+    return change_yaws
 
 
-def inverted(motion):
-    rotations = Rotation.from_quat(np.roll(motion.quaternions, -1, axis=1)).inv()
-    return changed(motion, -rotations.apply(motion.translations), rotations)
+def inverted(at, turned):
+    return -turned.inv().apply(at), turned.inv()
 
 
 X_LEFT = np.array([[0, 1.0, 0], [-1, 0, 0], [0, 0, 1]])
 OPTICAL = np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])
 MISTAKES = {
-    "swapped": (lambda motion: changed(motion, motion.translations[:, [1, 0, 2]]), "motion-axes", "hold y, x"),
-    "negated": (lambda motion: changed(motion, motion.translations * (1, -1, 1)), "motion-axes", "hold x, -y"),
-    "left-handed": (lambda motion: with_axes(motion, np.diag([1.0, -1, 1])), "motion-axes", "x forward, y right"),
-    "x left": (lambda motion: with_axes(motion, X_LEFT), "motion-axes", "x left"),
-    "camera axes": (lambda motion: with_axes(motion, OPTICAL), "motion-axes", "x right, y down"),
-    "degrees": (lambda motion: with_yaws(motion, np.degrees), "motion-angles", "in degrees, taken for radians"),
-    "radians": (lambda motion: with_yaws(motion, np.radians), "motion-angles", "in radians, taken for degrees"),
-    "compass": (lambda motion: with_yaws(motion, lambda yaws: np.pi / 2 - yaws), "motion-angles", "as a compass"),
-    "clockwise": (lambda motion: with_yaws(motion, lambda yaws: -yaws), "motion-angles", "clockwise from x"),
-    "no rotations": (lambda motion: with_yaws(motion, np.zeros_like), "motion-angles", "the course"),
+    "swapped": (lambda at, turned: (at[:, [1, 0, 2]], turned), "motion-axes", "hold y, x"),
+    "negated": (lambda at, turned: (at * (1, -1, 1), turned), "motion-axes", "hold x, -y"),
+    "left-handed": (with_axes(np.diag([1.0, -1, 1])), "motion-axes", "x forward, y right"),
+    "x left": (with_axes(X_LEFT), "motion-axes", "x left"),
+    "camera axes": (with_axes(OPTICAL), "motion-axes", "x right, y down"),
+    "degrees": (with_yaws(np.degrees), "motion-angles", "in degrees, taken for radians"),
+    "radians": (with_yaws(np.radians), "motion-angles", "in radians, taken for degrees"),
+    "compass": (with_yaws(lambda yaws: np.pi / 2 - yaws), "motion-angles", "as a compass"),
+    "clockwise": (with_yaws(lambda yaws: -yaws), "motion-angles", "clockwise from x"),
+    "no rotations": (with_yaws(np.zeros_like), "motion-angles", "the course"),
     "inverted": (inverted, "motion-inverted", "body_from_world"),
 }  # fmt: skip
 
@@ -70,7 +70,7 @@ def test_the_reading_that_fits_is_named(street, monkeypatch, name):
     drive, pairs, motion = street
     monkeypatch.setattr(judge, "camera_pairs", lambda *_: pairs)
     change, code, words = MISTAKES[name]
-    finding, undone = fitting_poses(drive, change(motion))
+    finding, undone = fitting_poses(drive, changed(motion, change))
     assert finding.code == code, finding
     assert words in finding.found
     at, true = (

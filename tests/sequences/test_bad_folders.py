@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from bevcli.errors import InputError
-from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.open import open_sequence
-from bevcli.sequences.options import InputOptions
 
 
 def message(folder, place=0, **options):
@@ -284,15 +282,6 @@ def test_numbered_images_take_their_times_from_timing_toml(drive):
         for camera, image in stated.images.items():
             assert mine.images[camera].timestamp_ns == image.timestamp_ns
             np.testing.assert_array_equal(mine.images[camera].pixels_bgr, image.pixels_bgr)
-
-
-def test_missing_image_number_leaves_a_gap_in_time(drive):
-    (drive / "frames.csv").unlink()
-    for camera in ("CAM_FRONT", "CAM_BACK"):
-        (drive / "images" / camera / "1.png").unlink()
-    sequence = FolderDrive(drive, InputOptions(ego_motion="static"))
-    assert [stamp.timestamp_ns for stamp in sequence.stamps] == [0, 10**9, 15 * 10**8]
-    assert any("assumed" in note for note in sequence.notes)
 
 
 def test_ground_truth_in_the_ego_frame_is_moved_to_the_world(drive):

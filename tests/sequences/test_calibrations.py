@@ -126,14 +126,20 @@ SPELLINGS = {
 
 @pytest.mark.parametrize(
     ("layout", "spelling"),
-    [*(("mapping", spelling) for spelling in SPELLINGS), ("list", "T_cam_ego"), ("folder", "quaternion")],
+    [
+        *(("mapping", spelling) for spelling in SPELLINGS),
+        ("list", "T_cam_ego"),
+        ("rows", "flat"),
+        ("folder", "quaternion"),
+    ],
 )
 def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
     cameras = {name: SPELLINGS[spelling](name) for name in NAMES}
     if layout == "mapping":
         path = written(tmp_path, cameras)
-    elif layout == "list":
-        path = written(tmp_path, {"cameras": [{"name": name, **each} for name, each in cameras.items()]}, "rig.json")
+    elif layout != "folder":
+        rows = [{"name": name, **each} for name, each in cameras.items()]
+        path = written(tmp_path, {"cameras": rows} if layout == "list" else rows, "rig.json")
     else:
         path = {written(tmp_path, each, f"rig/{name}.yaml").parent for name, each in cameras.items()}.pop()
     found = read(path)
@@ -229,12 +235,16 @@ def test_colmap(tmp_path):
     assert_is_the_street(read(folder, extrinsics=poses).rig, lens=True)
 
 
-def test_kitti(tmp_path):
+@pytest.mark.parametrize("tracking", [False, True])
+def test_kitti(tmp_path, tracking):
     """The drawing of the vehicle: cameras 1.65 m above the road; the Velodyne 1.73 m, and 0.27 m behind them."""
     k = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]])
     rows = {"P2": k @ np.c_[np.eye(3), [0.06, 0, 0]], "R0_rect": np.eye(3)}
     rows["Tr_velo_to_cam"] = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
-    path = written(tmp_path, lines_of(rows), "000000.txt")
+    text = lines_of(rows)
+    if tracking:
+        text = text.replace("R0_rect:", "R_rect").replace("Tr_velo_to_cam:", "Tr_velo_cam")
+    path = written(tmp_path, text, "000000.txt")
     images = tmp_path / "images" / "image_2"
     images.mkdir(parents=True)
     cv2.imwrite(str(images / "0.png"), np.zeros((375, 1242, 3), np.uint8))

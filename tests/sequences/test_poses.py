@@ -184,6 +184,8 @@ def kitti(poses) -> str:
 
 
 def test_kitti_is_of_camera_0_with_times_beside_it(circle, tmp_path):
+    with pytest.raises(InputError, match=r"60 poses without times, and the drive has 9 frames: put times.txt beside"):
+        read(tmp_path, kitti(camera_poses(first_world=True)))
     (tmp_path / "times.txt").write_text("\n".join(f"{STEP * place * 1e-9:.6e}" for place in range(COUNT)))
     found = read(tmp_path, kitti(camera_poses(first_world=True)), frames=FRAMES - START)
     np.testing.assert_array_equal(found.motion.timestamps_ns, TIMES - START)
@@ -192,15 +194,6 @@ def test_kitti_is_of_camera_0_with_times_beside_it(circle, tmp_path):
         "KITTI, 60 rows at 10.0 Hz, seconds, world_from_body, axes x right, y down, z forward, of image_0; cover all"
         in found.notes[0]
     )
-
-
-def test_kitti_without_times_has_those_of_the_frames(circle, tmp_path):
-    text = kitti(camera_poses(first_world=True))
-    found = read(tmp_path, text, frames=TIMES)
-    np.testing.assert_allclose(relative(found.motion), relative(circle), atol=1e-6)
-    assert "the times of the frames" in found.notes[0]
-    with pytest.raises(InputError, match=r"60 poses without times, and the drive has 9 frames: put times.txt beside"):
-        read(tmp_path, text)
 
 
 @pytest.mark.parametrize("first_world", [True, False])
@@ -234,10 +227,7 @@ def test_angles_that_nothing_decides_are_readings(unit, turn, tmp_path):
     assert usual == {"degrees", "radians"}
     found = read(tmp_path, standing("0"), pose_angles=unit)
     assert Pose(np.zeros(3), found.motion.quaternions[-1]).yaw == pytest.approx(turn)
-
-
-def test_the_angle_of_a_vehicle_that_stands_needs_no_unit(tmp_path):
-    assert read(tmp_path, standing("0.5")).motion.velocities == pytest.approx(0)
+    assert read(tmp_path, standing("0.5")).motion.velocities == pytest.approx(0)  # one that does not turn needs no unit
 
 
 def test_times_of_frames_that_are_not_known_are_asked_for(circle, tmp_path):
@@ -338,15 +328,6 @@ def test_a_place_on_earth_becomes_that_of_the_drive(drive, tmp_path):
     assert (opened.facts.geo_origin.latitude_deg, opened.facts.geo_origin.longitude_deg) == (48, 11.5)
     moved = opened.load(2).world_from_ego.translation - opened.load(0).world_from_ego.translation
     assert moved == pytest.approx([0, 55.6, 0], abs=0.1)  # a second, 0.0005 degrees of latitude
-
-
-def test_the_heading_of_gps_is_clockwise_from_north(tmp_path):
-    there = ["48"] * COUNT, ["11"] * COUNT, np.linspace(0, 5, COUNT)
-    found = read(tmp_path, lines(S, *there, separator=",", header="t,lat,lon,heading"))
-    yaws = [np.degrees(Pose(np.zeros(3), quaternion).yaw) for quaternion in found.motion.quaternions]
-    assert yaws == pytest.approx(90 - np.linspace(0, 5, COUNT))
-    turned = read(tmp_path, lines(S, X, Y, COMPASS, separator=",", header="t,x,y,heading"), pose_angles="compass")
-    assert Pose(np.zeros(3), turned.motion.quaternions[0]).yaw == pytest.approx(YAW[0])
 
 
 def test_pitch_lifts_the_nose_with_a_heading_from_north(tmp_path):

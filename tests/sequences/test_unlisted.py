@@ -317,17 +317,6 @@ def test_a_sequence_folder_may_have_images_of_some_cameras(tmp_path):
     assert any(note.startswith("without images, left out: CAM_FRONT_RIGHT, ") for note in sequence.notes)
 
 
-def test_a_list_of_cameras_in_json(tmp_path):
-    cameras = [{"name": name, **{key: value for key, value in facts.items() if key != "distortion"}}
-               for name, facts in FACTS.items()]  # fmt: skip
-    (tmp_path / "rig.json").write_text(json.dumps(cameras))
-    drive = images_of(tmp_path / "drive", *FACTS)
-    rig = open_sequence(drive, calibration=tmp_path / "rig.json", image_rate_hz=2, ego_motion="static").rig
-    assert rig.names == tuple(FACTS)
-    place = FACTS["CAM_BACK"]["ego_from_camera"]["translation"]
-    np.testing.assert_allclose(rig["CAM_BACK"].ego_from_camera[:3, 3], place)
-
-
 def test_the_time_of_the_first_image_may_be_stated_for_any_times(tmp_path):
     """A computer without a clock wrote the poses: the advice of the error is followed."""
     drive = images_of(tmp_path, "CAM_FRONT", count=4)
@@ -473,15 +462,3 @@ def test_kitti_360_as_it_lies_on_disk(tmp_path):
 
 def text_of(matrix):
     return " ".join(f"{number:.9e}" for number in np.ravel(matrix))
-
-
-def test_a_calibration_of_kitti_tracking_has_no_colons(tmp_path):
-    drive = images_of(tmp_path, "image_2")
-    rows = {"P2": np.column_stack([FACTS["CAM_FRONT"]["intrinsics"], np.zeros(3)]), "R_rect": np.eye(3)}
-    rows["Tr_velo_cam"] = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
-    text = [f"P2: {text_of(rows.pop('P2'))}", *(f"{name} {text_of(row)}" for name, row in rows.items())]
-    (tmp_path / "calib/0000.txt").parent.mkdir()
-    (tmp_path / "calib/0000.txt").write_text("\n".join(text))
-    how = {"calibration": tmp_path / "calib/0000.txt", "image_rate_hz": 10, "ego_motion": "static"}
-    place = open_sequence(drive, **how).rig["image_2"].ego_from_camera[:3, 3]
-    np.testing.assert_allclose(place, (0.76 + 0.27, 0, 1.73 - 0.08), atol=1e-9)  # of the Velodyne, and of the camera
