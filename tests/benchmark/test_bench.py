@@ -112,6 +112,8 @@ def test_profile_of_a_frame_in_half_precision(small_model_file, tmp_path):
     answer = invoked("bench", "--model", small_model_file, *options)
     assert "bf16" in answer.stdout
     assert json.loads(profile.read_text())["traceEvents"]
+    with pytest.raises(BevcliError, match=r"none/p\.json: cannot be written"):
+        invoked("bench", "--model", small_model_file, "--count", 1, "--profile", tmp_path / "none/p.json")
 
 
 def test_engines_are_compared_as_they_are():

@@ -38,6 +38,7 @@ from bevcli.workshop.benchmark.versions import (
     made_up_model,
     wait_for,
 )
+from bevcli.writing import whole_file
 
 MIN_RUN_FRAMES = 4  # of a run with reading and recording; the times between them are measured, but for the last
 RUN_FRAMES = 12  # of a run if frames are short
@@ -176,9 +177,10 @@ def run_benchmark(
     preprocessor = Preprocessor(config)
     prepared = preprocessor(drive.load(0))
     if profile_path is not None:
-        with torch.profiler.profile() as profile:
-            fast.step(prepared)
-        profile.export_chrome_trace(str(profile_path))
+        with whole_file(profile_path) as unfinished:
+            with torch.profiler.profile() as profile:
+                fast.step(prepared)
+            profile.export_chrome_trace(str(unfinished))
     comparison = None
     if against_plain:
         inputs = (preprocessor(drive.load(index)) for index in range(frames))
