@@ -122,9 +122,10 @@ def model_faults(model: Model, drive: Drive) -> tuple[Finding, ...]:
     first = (len(drive.stamps) - count) // 2
     some = select(drive, range(first, first + count))
     steps = list(run(model, some, temporal=False, track=False))
+    if broken := engine_findings(model, some, [one.boxes for _, one in steps]):
+        return broken
     held = [(frame, one.boxes_world, load_witness().seen(frame)) for frame, one in steps]
-    broken = engine_findings(model, some, [one.boxes for _, one in steps])
-    return broken or (*color_findings(held), *weights_findings(model, held))
+    return (*color_findings(held), *weights_findings(model, held))
 
 
 def engine_findings(model: Model, drive: Drive, boxes: Sequence[Boxes3D]) -> tuple[Finding, ...]:
