@@ -119,10 +119,14 @@ class RecordedFrame:
 
 
 class RecordingReader:
-    """A recording that `Recording` wrote. Raises InputError if the file cannot be read or holds several recordings."""
+    """A recording that `Recording` wrote. Raises InputError if the file cannot be read or holds several recordings.
+
+    Attributes:
+        left_out: frames without their vehicle or boxes, of the last call of `frames`.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.left_out = path, 0
         with self._reading():
             self._reader = RrdReader(path)
             count = len(self._reader.recordings())
@@ -146,8 +150,9 @@ class RecordingReader:
     def frames(self) -> Iterator[RecordedFrame]:
         """The frames in order, each with the state of all entities.
 
-        A frame without its vehicle or its boxes is left out: the file was cut within it, or another program wrote it.
+        A frame without its vehicle or its boxes is left out: the file is cut or damaged, or another program wrote it.
         """
+        self.left_out = 0
         still: list[Logged] = []
         firsts: list[float] = []
         for chunk in self.chunks():
@@ -164,6 +169,8 @@ class RecordingReader:
                 state = _applied(state | {entity: static.get(entity, {}) for entity in OF_EACH_FRAME}, rows)
                 if {entity for _, entity, _ in rows}.issuperset(OF_EACH_FRAME):
                     yield RecordedFrame(frame, state, self.path)
+                else:
+                    self.left_out += 1
 
     def check_frame(self, index: int) -> None:
         """Raise InputError, which names the nearest frames, if the recording does not have a frame."""
@@ -278,9 +285,11 @@ def summarise(path: Path, read_from: Path | None = None) -> str:
         times.append(recorded.stamp.timestamp_ns)
         title = "".join(frame.texts(entities.RUN, "title"))
         untrained = any(frame.integers(entities.RUN, "untrained"))
+    if reader.left_out:
+        span = f" ({reader.left_out} without vehicle or boxes left out: is the file damaged?)"
     if times:
         start = datetime.fromtimestamp(min(times) / 1e9, UTC).isoformat(sep=" ", timespec="milliseconds")
-        span = f", {(max(times) - min(times)) / 1e9:.2f} s from {start}"
+        span = f", {(max(times) - min(times)) / 1e9:.2f} s from {start}{span}"
     by_size = sizes.most_common()
     rest = by_size[SHOWN_ENTITIES:]
     return "\n".join([
