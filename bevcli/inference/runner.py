@@ -5,7 +5,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -22,6 +22,7 @@ from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
 from bevcli.model.config import ImageConfig, ModelConfig
 from bevcli.model.network import Network
+from bevcli.model.road_slopes import FollowedPoints
 from bevcli.model.step import ModelOutputs, PreparedFrame
 from bevcli.model.temporal_model import TemporalModel
 from bevcli.parsing.documents import read_json
@@ -214,11 +215,14 @@ class Runner:
         A model that looks ahead sees the later ones of these frames.
         """
         ahead = self.config.later_frames if self.options.temporal else 0
+        depth, threads = 2, 1
         if self.device.type == "cuda":
             depth, threads = frames_ahead(self.config.image, len(drive.rig.cameras), os.cpu_count() or 1)
             source = read_ahead(self.prepare, indices, depth, threads, load=drive.load)
         else:  # the processor is busy with the model: one thread for both keeps up
             source = read_ahead(lambda index: self.prepare(drive.load(index)), indices)
+        if self.config.levels and self.options.temporal:
+            source = read_ahead(with_points, pairwise(chain((None,), source)), depth, threads)
         waiting = deque(islice(source, ahead + 1))
         while waiting:
             prepared = waiting.popleft()
@@ -310,10 +314,20 @@ class Runner:
         )
 
 
+def with_points(frames: tuple[PreparedFrame | None, PreparedFrame]) -> PreparedFrame:
+    """The second of two frames, with the points that were followed from the first one."""
+    before, prepared = frames
+    if before is None or before.grey is None or prepared.grey is None:
+        return prepared
+    poses = before.frame.world_from_ego, prepared.frame.world_from_ego
+    return replace(prepared, points=FollowedPoints.follow(before.grey, poses[0], prepared.grey, poses[1]))
+
+
 def frames_ahead(image: ImageConfig, cameras: int, cores: int) -> tuple[int, int]:
     """How many frames are prepared ahead of a GPU, and in how many threads.
 
     Each of the frames holds its network input; together these take at most AHEAD_BYTES, but are never less than two.
+    Where points are followed in them, as many are ahead once more.
     A quarter of the cores prepares images; the others decode images, or record.
     """
     width, height = image.padded_size

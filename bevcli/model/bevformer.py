@@ -14,7 +14,7 @@ from bevcli.model.ego_motion import map_rotation, turned_history
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.network import Network
 from bevcli.model.pillar_projection import PillarHits
-from bevcli.model.road_slopes import RoadMemory, RoadSlopes, expected_slopes, upright_cameras
+from bevcli.model.road_slopes import FollowedPoints, RoadMemory, RoadSlopes, expected_slopes, upright_cameras
 from bevcli.model.step import Clip, ModelInputs, ModelOutputs, PreparedFrame, model_inputs
 from bevcli.model.upload import on_device, upload, upload_together
 
@@ -69,9 +69,15 @@ class BEVFormer(Network):
 
     @staticmethod
     def slopes_before(prepared: PreparedFrame, memory: BevHistory | None) -> RoadSlopes | None:
-        """See `expected_slopes`; memory: of the frame before."""
-        road, pose = (None, None) if memory is None else (memory.road, memory.pose)
-        return expected_slopes(road, pose, prepared.grey, prepared.frame.world_from_ego)
+        """See `expected_slopes`; None for a model that does not ask for them. memory: of the frame before."""
+        if prepared.grey is None:
+            return None
+        if memory is None or memory.road is None:
+            return RoadSlopes.unknown()
+        points, road, pose = prepared.points, memory.road, memory.pose
+        if points is None or points.view is not road.view or points.pose is not pose:  # not those of this memory
+            points = FollowedPoints.follow(road.view, pose, prepared.grey, prepared.frame.world_from_ego)
+        return expected_slopes(road, points)
 
     @staticmethod
     def history_after(prepared: PreparedFrame, bev: Tensor, slopes: RoadSlopes | None) -> BevHistory:

@@ -16,7 +16,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
 from bevcli.model.pillar_projection import project_points
-from bevcli.model.road_slopes import RoadSlopes
+from bevcli.model.road_slopes import RoadSlopes, level_from_bev
 from bevcli.model.upload import upload_together
 from bevcli.parsing.documents import Count, CountOrNone
 
@@ -105,12 +105,10 @@ class HybridQueries(nn.Module):
         information = inverse_of_two(covariance)
         sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
         slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
-        one, zero = torch.ones_like(slopes[:, :1]), torch.zeros_like(slopes[:, :1])
-        forward, up = torch.cat([one, zero, slopes[:, :1]], -1), torch.cat([-slopes, one], -1)
-        x, z = F.normalize(forward, dim=-1), F.normalize(up, dim=-1)
+        axes = [torch.stack(axis, -1) for axis in level_from_bev(*slopes.unbind(-1))]  # of the level frame
         bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
-        bev_from_level[:, :3, :3] = torch.stack([x, torch.linalg.cross(z, x), z], -1)
-        bev_from_level[:, :3, 3] = self.lift.ground_z * (zero.new_tensor([0.0, 0.0, 1.0]) - z)
+        bev_from_level[:, :3, :3] = torch.stack(axes, -1)
+        bev_from_level[:, :3, 3] = self.lift.ground_z * (slopes.new_tensor([0.0, 0.0, 1.0]) - axes[2])
         return image_from_bev @ bev_from_level[:, None], told
 
     def weighed(

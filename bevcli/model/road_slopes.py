@@ -11,6 +11,7 @@ turned, not only the rig.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,23 +68,27 @@ class RoadMemory:
     slopes: RoadSlopes
 
 
-def expected_slopes(
-    memory: RoadMemory | None, before: Pose | None, view: GreyView | None, now: Pose
-) -> RoadSlopes | None:
-    """The slopes of a frame before its boxes are looked at; None for a model that does not ask for them.
+@dataclass(frozen=True)
+class FollowedPoints:
+    """What points told of the slopes that were followed from a frame before. It takes a tenth of a second."""
 
-    memory, before: of the last frame, None without one. view, now: of this frame, as world_from_ego.
-    """
-    if view is None:
-        return None
-    if memory is None or before is None:
+    view: GreyView  # of the frame before
+    pose: Pose  # its world_from_ego
+    told: tuple[Array, Array] | None  # see `slopes_by_points`
+
+    @classmethod
+    def follow(cls, view: GreyView, pose: Pose, next_view: GreyView, next_pose: Pose) -> "FollowedPoints":
+        """From a frame to the next one."""
+        first = _level(pose.matrix @ view.ego_from_bev.numpy())
+        second = _level(next_pose.matrix @ next_view.ego_from_bev.numpy())
+        return cls(view, pose, slopes_by_points(view, next_view, inverse(second) @ first))
+
+
+def expected_slopes(memory: RoadMemory, points: FollowedPoints) -> RoadSlopes:
+    """The slopes of a frame before its boxes are looked at. memory: of the frame that points were followed from."""
+    if points.told is None:
         return RoadSlopes.unknown()
-    first = _level(before.matrix @ memory.view.ego_from_bev.numpy())
-    second = _level(now.matrix @ view.ego_from_bev.numpy())
-    told = slopes_by_points(memory.view, view, inverse(second) @ first)
-    if told is None:
-        return RoadSlopes.unknown()
-    information, pull = told
+    information, pull = (x.copy() for x in points.told)
     old = np.linalg.inv(memory.slopes.covariance[0].double().numpy())
     information[:2, :2] += old
     pull[:2] += old @ memory.slopes.mean[0].double().numpy()
@@ -121,7 +126,8 @@ def slopes_by_points(first: GreyView, second: GreyView, b_from_a: Array) -> tupl
 
     def residuals(slopes: Array) -> Array:
         """Distances from the epipolar lines; of a vehicle that stands, from where the points were. Pixels."""
-        turned, seen = a @ (b_from_a[:3, :3] @ level_from_bev(slopes[:2])).T, b @ level_from_bev(slopes[2:]).T
+        turn_a, turn_b = (np.array(level_from_bev(*pair)) for pair in (slopes[:2], slopes[2:]))
+        turned, seen = a @ (b_from_a[:3, :3] @ turn_a).T, b @ turn_b.T
         if stands:
             return np.asarray((pixels_of_ray[:, None] * np.cross(turned, seen)).ravel())
         normal_a, normal_b = np.cross(ways, turned), np.cross(ways, seen)
@@ -154,11 +160,12 @@ def _followed(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> tuple[Arra
     return start[kept, 0].astype(np.float64), end[kept, 0].astype(np.float64)
 
 
-def level_from_bev(slopes: Array) -> Array:
-    """(3, 3), for a road with slopes (2,) in the bev frame; the heading stays."""
-    forward, up = np.array([1.0, 0.0, slopes[0]]), np.array([-slopes[0], -slopes[1], 1.0])
-    x, z = forward / np.linalg.norm(forward), up / np.linalg.norm(up)
-    return np.stack([x, np.cross(z, x), z])
+def level_from_bev(along_x: Any, along_y: Any) -> Any:
+    """Three rows of three numbers or tensors, for a road with such slopes in the bev frame; the heading stays."""
+    x = (1 + along_x**2) ** -0.5
+    z = (1 + along_x**2 + along_y**2) ** -0.5
+    left = -x * z * along_x * along_y, x * z * (1 + along_x**2), x * z * along_y
+    return (x, 0 * x, x * along_x), left, (-z * along_x, -z * along_y, z)
 
 
 def _level(world_from_bev: Array) -> Array:

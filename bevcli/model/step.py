@@ -18,7 +18,7 @@ from bevcli.model.config import ModelConfig
 from bevcli.model.decoder import best_boxes
 from bevcli.model.ego_motion import ego_motion_inputs
 from bevcli.model.image_boxes import ImageBoxes
-from bevcli.model.road_slopes import GreyView, RoadSlopes
+from bevcli.model.road_slopes import FollowedPoints, GreyView, RoadSlopes
 from bevcli.model.segmentation import STUFF_CLASSES, SegmentationOutputs
 from bevcli.model.upload import upload
 
@@ -46,6 +46,7 @@ class PreparedFrame:
         has_image: (1, N) bool.
         pixels: the images are as an exported file takes them, which normalises them itself.
         grey: the images once more, for a model that levels the rig of each frame.
+        points: followed ahead from the frame before; None where the step follows them.
     """
 
     frame: Frame
@@ -57,6 +58,7 @@ class PreparedFrame:
     has_image: Tensor
     pixels: bool = False
     grey: GreyView | None = None
+    points: FollowedPoints | None = None
 
 
 @dataclass(frozen=True)

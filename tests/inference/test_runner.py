@@ -18,8 +18,11 @@ from bevcli.inference.pipeline import read_ahead, write_behind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import AHEAD_BYTES, Runner, RunnerState, frames_ahead
 from bevcli.model.bevformer import BEVFormer
+from bevcli.model.hybrid_queries import HybridQueriesConfig
+from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.pillar_projection import project_pillars
 from bevcli.model.prepare import prepare_for_inference
+from bevcli.model.road_slopes import RoadSlopes
 
 
 def test_history_matters(mini_model):
@@ -27,6 +30,22 @@ def test_history_matters(mini_model):
     with_history, without = run(mini_model, sequence)[0][1], run(mini_model, sequence, temporal=False)[0][1]
     assert (with_history.bev - without.bev).abs().max() > 1e-3
     assert (with_history.started_anew, str(without.started_anew)) == (None, "history is off")
+
+
+def test_points_are_followed_ahead_of_the_step_that_they_are_for(mini_config):
+    hybrid = HybridQueriesConfig(8, level=True)
+    config = replace(mini_config, image_detector=NanoDetConfig(max_boxes=4), hybrid_queries=hybrid)
+    first, second = (prepared for prepared, _ in Runner(BEVFormer(config), CPU).frames(MemoryDrive(2), range(2)))
+    points = second.points
+    assert (first.points, points.view, points.pose) == (None, first.grey, first.frame.world_from_ego)
+    assert points.told is None  # of noise
+    known = replace(points, told=(np.diag([0, 0, 1e8, 1e8]), np.array([0, 0, 1e6, -1e6])))
+    memory = BEVFormer.history_after(first, torch.zeros(1), RoadSlopes.unknown())
+    slopes = BEVFormer.slopes_before(replace(second, points=known), memory)
+    assert slopes.mean[0].tolist() == pytest.approx([0.01, -0.01], abs=1e-5)
+    for other in (replace(memory, pose=MemoryDrive(1).pose(0)), memory):  # an odometry knows better; no points
+        frame = second if other is memory else replace(second, points=known)
+        assert not BEVFormer.slopes_before(frame, other).mean.any()
 
 
 def test_autocast_around_a_run_has_no_effect(mini_model):

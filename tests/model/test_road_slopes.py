@@ -10,6 +10,7 @@ from torch import Tensor
 from bevcli.geometry.transforms import Pose
 from bevcli.model.road_slopes import (
     SPREAD,
+    FollowedPoints,
     GreyView,
     RoadMemory,
     RoadSlopes,
@@ -28,7 +29,7 @@ YAWS = np.radians([0, 90, 180, 270])
 def seen(slopes=(0.0, 0.0), ahead=0.0) -> GreyView:
     """Dots around a rig of four cameras that travelled `ahead` metres along y and is tilted by slopes."""
     images, projections = np.zeros((len(YAWS), HEIGHT, WIDTH), np.uint8), []
-    points = (POINTS - [0.0, ahead, 0.0]) @ level_from_bev(np.array(slopes))  # in the tilted bev frame
+    points = (POINTS - [0.0, ahead, 0.0]) @ np.array(level_from_bev(*slopes))  # in the tilted bev frame
     for image, yaw in zip(images, YAWS, strict=True):
         right, forward = (np.cos(yaw), np.sin(yaw), 0.0), (-np.sin(yaw), np.cos(yaw), 0.0)
         camera_from_bev = np.array([right, (0.0, 0.0, -1.0), forward])
@@ -52,7 +53,7 @@ def told(before: GreyView, now: GreyView, ahead: float, known: RoadSlopes | None
     """What is expected of the second frame; known: of the first."""
     memory = RoadMemory(before, known or RoadSlopes.unknown())
     poses = [Pose.from_matrix(np.block([[np.eye(3), np.array([[0], [y], [0]])], [np.zeros(3), 1]])) for y in (0, ahead)]
-    return expected_slopes(memory, poses[0], now, poses[1])
+    return expected_slopes(memory, FollowedPoints.follow(before, poses[0], now, poses[1]))
 
 
 def test_the_way_along_the_road_tells_the_pitch_and_turns_tell_changes():
@@ -79,11 +80,9 @@ def test_nothing_is_told_by_poses_of_other_images_nor_by_empty_ones():
     sideways = Pose.from_matrix(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [np.zeros(3), 1]]))
     memory = RoadMemory(before, RoadSlopes(torch.ones(1, 2), 1e-6 * torch.eye(2)[None]))
     for view in (now, *empty):
-        result = expected_slopes(memory, Pose.identity(), view, sideways)
+        result = expected_slopes(memory, FollowedPoints.follow(before, Pose.identity(), view, sideways))
         assert torch.equal(result.covariance, RoadSlopes.unknown().covariance)
         assert not result.mean.any()
-    assert expected_slopes(memory, Pose.identity(), None, sideways) is None
-    assert torch.equal(expected_slopes(None, None, now, sideways).mean, torch.zeros(1, 2))
 
 
 def test_a_camera_that_lacks_an_image_in_one_of_the_frames_is_left_out():
@@ -119,7 +118,7 @@ def picture(image_from_bev: Tensor) -> Tensor:
 
 def test_images_and_cameras_are_those_of_a_level_vehicle() -> None:
     """Each pixel has the colour of its direction; the centre of the camera is where the tilted vehicle holds it."""
-    level = torch.from_numpy(level_from_bev(np.array([0.02, -0.03]))).float()
+    level = torch.tensor(level_from_bev(0.02, -0.03))
     image_from_bev, at = camera(torch.eye(3), CENTER), level @ CENTER
     image_from_level = camera(level.T, at)
     upright_from_level, image_from_upright = upright_cameras(image_from_bev, image_from_level)
