@@ -12,7 +12,8 @@ from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation_from_quaternion
 
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
-TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted and gets the nearest pose
+TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted: the motion goes on there
+STEADY_NS = 100_000_000  # least time between the poses that tell it: of closer ones the noise would be too large
 ROAD_S = 5.0  # the mean of the vehicle's upward axis over this time before and after is taken for the road's
 BLOCK, AROUND = 65_536, 2  # rows whose motion is derived at once, and rows around them: of a difference of differences
 LONGEST_S = 0.5  # that a pose counts for in that mean
@@ -79,19 +80,20 @@ class EgoMotion:
     def pose_at(self, timestamp_ns: int) -> Pose:
         """world_from_ego at a time. The pose of an exactly matching row is returned unchanged.
 
-        Translation is interpolated linearly, rotation by slerp.
+        Translation is interpolated linearly, rotation by slerp; outside the stored range both go on as they were (see
+        `rows_around`).
         Raises InputError if the time is more than 50 ms outside the stored range.
         """
-        row, fraction = self._locate(timestamp_ns)
+        row, later, fraction = self._locate(timestamp_ns)
         start = Pose(self.translations[row], self.quaternions[row])
         if fraction == 0:
             return start
-        return interpolate(start, Pose(self.translations[row + 1], self.quaternions[row + 1]), fraction)
+        return interpolate(start, Pose(self.translations[later], self.quaternions[later]), fraction)
 
     def kinematics_at(self, timestamp_ns: int) -> Kinematics:
         """Acceleration, angular rate and velocity at a time, interpolated linearly. Raises InputError as `pose_at`."""
-        row, fraction = self._locate(timestamp_ns)
-        later = min(row + 1, len(self.timestamps_ns) - 1)
+        row, later, fraction = self._locate(timestamp_ns)
+        fraction = min(max(fraction, 0.0), 1.0)
         columns = self.accelerations, self.angular_rates, self.velocities
         return Kinematics(*(column[row] + fraction * (column[later] - column[row]) for column in columns))
 
@@ -101,8 +103,8 @@ class EgoMotion:
         Where it is not measured, the road is as the vehicle stands on the mean, over which the body pitches and rolls:
         what poses state against gravity may be the slope of the road. Raises InputError as `pose_at`.
         """
-        row, fraction = self._locate(timestamp_ns)
-        normal = self._road_normals[row + round(fraction)]
+        row, later, fraction = self._locate(timestamp_ns)
+        normal = self._road_normals[later if fraction > 0.5 else row]
         return np.asarray(rotation_from_quaternion(self.pose_at(timestamp_ns).quaternion).T @ normal)
 
     @cached_property
@@ -119,18 +121,31 @@ class EgoMotion:
         normals = sums[end] - sums[begin]
         return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
-    def _locate(self, timestamp_ns: int) -> tuple[int, float]:
-        times, first, last = self.timestamps_ns, self.first_ns, self.last_ns
+    def _locate(self, timestamp_ns: int) -> tuple[int, int, float]:
         if not self.covered(timestamp_ns):
             raise InputError(
-                f"ego-motion covers {first} to {last} ns, but an image or frame is at {timestamp_ns} ns "
-                "(at most 50 ms outside is allowed): add ego-motion for that time, or remove the frame"
+                f"ego-motion covers {self.first_ns} to {self.last_ns} ns, but an image or frame is at {timestamp_ns} "
+                "ns (at most 50 ms outside is allowed): add ego-motion for that time, or remove the frame"
             )
-        clipped = min(max(timestamp_ns, first), last)
-        row = int(np.searchsorted(times, clipped, side="right")) - 1
-        if row == len(times) - 1:
-            return row, 0.0
-        return row, (clipped - int(times[row])) / (int(times[row + 1]) - int(times[row]))
+        (row,), (later,), (fraction,) = rows_around(self.timestamps_ns, np.array([timestamp_ns]))
+        return int(row), int(later), float(fraction)
+
+
+def rows_around(
+    times_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Two rows of poses at increasing times (T,) around wanted ones (...), and where these lie: 0 to 1 between them.
+
+    Before the first row (below 0) or after the last (above 1), they are this row and the nearest one that is at least
+    `STEADY_NS` away from it.
+    """
+    last = len(times_ns) - 1
+    row = np.searchsorted(times_ns, wanted_ns, side="right") - 1
+    row = np.where(wanted_ns > times_ns[-1], np.searchsorted(times_ns[1:], times_ns[-1] - STEADY_NS, "right"), row)
+    later = np.where(row < 0, np.searchsorted(times_ns, times_ns[0] + STEADY_NS), row + 1)
+    later = np.minimum(np.where(wanted_ns > times_ns[-1], last, later), last)
+    row = np.maximum(row, 0)
+    return row, later, (wanted_ns - times_ns[row]) / np.maximum(times_ns[later] - times_ns[row], 1)
 
 
 def nearest(times: NDArray[Any], targets: ArrayLike) -> NDArray[np.int64]:

@@ -24,7 +24,9 @@ from bevcli.geometry.transforms import (
     rigid,
     rotation_about_z,
     rotation_from_quaternion,
+    wrap_angle,
 )
+from bevcli.workshop.formats.pose_readings import Poses
 
 RANDOM = np.random.default_rng(1)
 
@@ -151,12 +153,17 @@ def test_between_rows_the_pose_lies_between():
     assert drive.pose_at(middle).yaw == pytest.approx(0.1)
 
 
-def test_time_more_than_50_ms_outside_is_an_error():
-    drive = circle_drive()
-    last = int(drive.timestamps_ns[-1])
-    assert (drive.pose_at(last + 50_000_000).translation == drive.translations[-1]).all()
-    with pytest.raises(InputError, match="50 ms"):
-        drive.pose_at(last + 50_000_001)
+@pytest.mark.parametrize("step_s", [0.005, 0.02, 0.5])
+def test_the_motion_goes_on_50_ms_outside_the_rows(step_s):
+    """On the circle, in the file of a drive and in that of another program; farther outside is an error."""
+    drive = circle_drive(step_s=step_s)
+    for time, seconds in ((drive.first_ns - 50_000_000, -0.05), (drive.last_ns + 50_000_000, 199 * step_s + 0.05)):
+        pose, yaw = drive.pose_at(time), 0.4 * seconds
+        np.testing.assert_allclose(pose.translation[:2], 20 * np.array([np.sin(yaw), 1 - np.cos(yaw)]), atol=0.05)
+        assert pose.yaw == pytest.approx(wrap_angle(yaw), abs=1e-6)
+        np.testing.assert_allclose(Poses.of(drive).at(np.array(time))[0], pose.matrix, atol=1e-4)
+        with pytest.raises(InputError, match="50 ms"):
+            drive.pose_at(time + (1 if seconds > 0 else -1))
 
 
 def upright(pitches, slope_deg=4.0, step_s=0.02):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
-from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion
+from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion, rows_around
 from bevcli.geometry.transforms import Array, GeoOrigin, Pose, inverse, rigid
 from bevcli.parsing.documents import CsvRow
 from bevcli.sequences.files.readings import (
@@ -355,13 +355,10 @@ class Poses:
         return cls(motion.timestamps_ns, rotations, motion.translations)
 
     def at(self, times_ns: NDArray[np.int64]) -> tuple[Array, NDArray[np.bool_]]:
-        """Poses (..., 4, 4) at times (...), and whether the rows cover them; between rows they are interpolated."""
+        """Poses (..., 4, 4) at times (...) as `EgoMotion.pose_at` has them, and whether the rows cover them."""
         covered = (times_ns >= self.times_ns[0] - TOLERANCE_NS) & (times_ns <= self.times_ns[-1] + TOLERANCE_NS)
-        last = len(self.times_ns) - 1
-        row = np.clip(np.searchsorted(self.times_ns, times_ns, side="right") - 1, 0, max(last - 1, 0))
-        later = np.minimum(row + 1, last)
-        duration = np.maximum(self.times_ns[later] - self.times_ns[row], 1)  # 0 for a single row
-        fraction = np.clip((times_ns - self.times_ns[row]) / duration, 0, 1)[..., None]
+        row, later, fraction = rows_around(self.times_ns, times_ns)
+        fraction = fraction[..., None]
         start, end = self.quaternions[row], self.quaternions[later]
         end = np.where((start * end).sum(-1, keepdims=True) < 0, -end, end)
         mixed = start + fraction * (end - start)  # neighbouring rows differ by little
