@@ -42,6 +42,17 @@ def test_the_images_tell_what_files_mean(name, street, tmp_path):
     assert "the images: " in " ".join(found.notes)
 
 
+def test_cameras_that_look_at_one_thing_tell_how_a_vehicle_that_stands_is_meant(tmp_path):
+    """Direction and rotations: the question asks for the height only, which no image of one time tells."""
+    truth = open_sequence(STREET, frames=slice(0, 1), ground_truth=False)
+    options = write(truth, tmp_path, Convention(transform="T", rotation="vector", origin_m=0.55))
+    with pytest.raises(InputError, match=r"the images do not tell its height: pass `--height 1\.5`"):
+        opened(tmp_path, options)
+    found = opened(tmp_path, options, height=np.mean([each.ego_from_camera[2, 3] for each in truth.rig.cameras]))
+    assert wrong(found, truth) == ""
+    assert re.search(r"the images: two cameras see \d\d+ points at once; .*: \d\)", " ".join(found.notes))
+
+
 @pytest.mark.slow
 def test_what_is_stated_is_believed_and_a_note_says_what_fits(street, tmp_path):
     options = write(street, tmp_path, Convention(rig_axes="rfu", transform="T"))

@@ -102,12 +102,9 @@ def differing(readings: Sequence[Reading]) -> list[str]:
 MOST_NAMED = 6  # readings in a message
 
 
-def question(where: object, why: str, readings: Sequence[Reading], alike: Sequence[Reading] = ()) -> InputError:
-    """The error that names readings and the options that state them. why: nothing decides between them.
-
-    alike: others that mean the same as one of them.
-    """
-    names = differing([*readings, *alike])
+def question(where: object, why: str, readings: Sequence[Reading]) -> InputError:
+    """The error that names readings and the options that state them. why: nothing decides between them."""
+    names = differing(readings)
     choices = " or ".join(f"`{each.flags(names)}`" for each in readings[:MOST_NAMED])
     more = f" or {len(readings) - MOST_NAMED} others" if len(readings) > MOST_NAMED else ""
     options = ", ".join(f"`{name}`" for name in names)

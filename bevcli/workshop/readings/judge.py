@@ -24,6 +24,7 @@ from bevcli.workshop.formats.pose_readings import ASIDE, FASTEST_M_S, MOVING_M_S
 from bevcli.workshop.formats.poses import of_reading
 from bevcli.workshop.readings.pairs import (
     MatchedPoints,
+    PointsAtOnce,
     body_motions,
     camera_pairs,
     height_above_road,
@@ -47,6 +48,8 @@ CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
 FEWEST_PAIRS, SURE_PAIRS = 2, 4  # of images, that decide; that refuse the only reading
+FRAMES_AT_ONCE = 2  # of a vehicle that stands, whose cameras see points together
+FEWEST_AT_ONCE, SHARE_AT_ONCE = 15, 0.25  # of these points in the reading that fits best; in others that may be meant
 MOST_RANK = 4  # of a rig and poses
 AROUND_NS = 10**9  # before and after the frames, as images may be a little off their times
 CHORD_NS, CHORDS = 500_000_000, 60  # of short steps, by which readings are compared
@@ -227,14 +230,18 @@ class Judged:
         best = min(found, key=lambda each: (each.residual_px > near, each.rank))
         usual = [each for each in found if each.rank <= best.rank]
         unsound = not best.is_sound or len(self._pairs) < FEWEST_PAIRS
-        alike = left = usual if unsound else [each for each in usual if each.residual_px <= clear]
+        left = usual if unsound else [each for each in usual if each.residual_px <= clear]
         left = [each for index, each in enumerate(left) if not any(each.is_like(other) for other in left[:index])]
         if unsound and differing([each.whole for each in left]) == ["pose_transform"]:
             left = [each for each in left if each.is_forward] or left
+        if len(left) > 1 and self._options.image_check and len(self._pairs) < FEWEST_PAIRS:
+            left, evidence = self._seen_at_once(left)
+            if len(left) == 1:
+                return left[0], evidence
         if len(left) > 1 and not unsound:
             left = [each for each in left if self._missing_height(each) == 0] or left
         if len(left) > 1:
-            return self._on_both_sides(left, alike)
+            return self._on_both_sides(left)
         is_stated = bool(self._draft.others or self._poses.others)
         if (
             unsound
@@ -258,6 +265,23 @@ class Judged:
         names = differing([left[0].whole, others[0].whole])
         other = f"{others[0].whole.words(names)}: {others[0].residual_px:.1f} px"
         return left[0], f"the images: {left[0].residual_px:.1f} px; {other}"
+
+    def _seen_at_once(self, left: list[Candidate]) -> tuple[list[Candidate], str]:
+        """The readings in which two cameras see points together, and the evidence; all where they see too few."""
+        frames = sorted({0, len(self._times) // FRAMES_AT_ONCE})
+        points = PointsAtOnce(self._drive, frames)
+        counts = [points.fitting(self._cameras(each.rig)) for each in left]
+        most = max(counts)
+        if most < FEWEST_AT_ONCE:
+            return left, ""
+        fitting = [each for each, count in zip(left, counts, strict=True) if count > SHARE_AT_ONCE * most]
+        others = [(each, count) for each, count in zip(left, counts, strict=True) if count <= SHARE_AT_ONCE * most]
+        if not others:
+            return left, ""
+        other, count = max(others, key=lambda each: each[1])
+        names = differing([fitting[0].whole, other.whole])
+        text = f"the images: two cameras see {most} points at once; {other.whole.words(names)}: {count}"
+        return fitting, text
 
     def fitting(self, chosen: Candidate | None) -> tuple[Candidate, str] | None:
         """The reading that fits the images where what is stated does not, and the residual of that, in words.
@@ -341,7 +365,7 @@ class Judged:
         fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if the poses are {text}"
         return f"{reading.words()} {fit}"
 
-    def _on_both_sides(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> tuple[Candidate, str]:
+    def _on_both_sides(self, left: Sequence[Candidate]) -> tuple[Candidate, str]:
         """The one of several axes of a rig in which most cameras have one like them on the other side of the vehicle.
 
         Raises InputError where more than these axes are open, or several are alike in this.
@@ -350,14 +374,14 @@ class Judged:
         most = max(counts)
         are_axes = differing([each.whole for each in left]) == ["rig_axes"] and self._options.image_check
         if not are_axes or counts.count(most) > 1:
-            raise self._question(left, alike)
+            raise self._question(left)
         chosen = left[counts.index(most)]
         others = [f"with {each.whole.flags(['rig_axes'])} {count}"
                   for each, count in zip(left, counts, strict=True) if each is not chosen]  # fmt: skip
         text = f"{most} of {len(self._draft.readings[0].ego_from_camera)} cameras are alike on both sides"
         return chosen, f"the images do not tell; {text}, {', '.join(others)}"
 
-    def _question(self, left: Sequence[Candidate], alike: Sequence[Candidate]) -> InputError:
+    def _question(self, left: Sequence[Candidate]) -> InputError:
         """The error that names the readings left, and the options that decide."""
         wholes = [each.whole for each in left]
         why = "the images do not tell which it is"
@@ -368,7 +392,7 @@ class Judged:
         else:
             why += f" (residuals {left[0].residual_px:.1f} px, {left[1].residual_px:.1f} px)"
             why += f"; {contradiction}" if (contradiction := self.contradiction(left[0])) else ""
-        return question(self._files(differing(wholes)), why, wholes, [each.whole for each in alike])
+        return question(self._files(differing(wholes)), why, wholes)
 
     def _files(self, names: Sequence[str]) -> str:
         """The files that options state."""

@@ -1,13 +1,14 @@
 """Two frames between which the vehicle moved: what both images of each camera tell of a reading.
 
-`MatchedPoints` is how far matched points are from where the readings of a rig and of poses put them.
+`MatchedPoints` is how far matched points are from where the readings of a rig and of poses put them. `PointsAtOnce` are
+those that two cameras see at one time, by which a vehicle that stands tells how they are turned to each other.
 `height_above_road` is the height at which the road of both images looks alike: the poses say how far the vehicle moved,
 and at any other height the points of the plane road are elsewhere in the second image.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ MOST = 4  # pairs of frames
 MOST_PX = 20.0  # a larger residual counts as this
 SHORTEST_WAY_M = 0.02  # a shorter way of a camera has no direction
 PARALLAX_PX = 2.0  # from which a point tells on which side of the camera it is
+AT_ONCE_PX = 3.0  # residual of a point that two cameras see at one time, in the reading that puts it there
 ASSUMED_M = 3.0  # way of a vehicle between two frames without poses
 HEIGHTS_M = 0.35, 4.5  # of a camera above the road
 RATIO = 1.02  # of two heights that are tried
@@ -152,15 +154,8 @@ class MatchedPoints:
 
     def residual_px(self, ego_from_camera: Array, ego_b_from_ego_a: Array) -> float:
         """The mean of the pairs' median residuals, reduced pixels. Arguments: (P, 4, 4), of each pair."""
-        points, medians = self._points, []
-        geometry = GroupGeometry(ego_from_camera, ego_from_camera, ego_b_from_ego_a, np.zeros(2))
-        off = np.abs(points.of(geometry)[:, 0])
-        relative = geometry.camera_b_from_camera_a[points.group]
-        turned = np.einsum("nij,nj->ni", relative[:, :3, :3], points.rays_a)
-        parallax = points.focal * np.linalg.norm(np.cross(turned, points.rays_b), axis=-1)
-        behind = (points.depths(geometry) < 0).any(-1) & (parallax > PARALLAX_PX)
-        stays = np.linalg.norm(relative[:, :3, 3], axis=-1) < SHORTEST_WAY_M
-        off = np.where(behind | stays | ((turned * points.rays_b).sum(-1) < 0), np.maximum(off, parallax), off)
+        geometry, medians = GroupGeometry(ego_from_camera, ego_from_camera, ego_b_from_ego_a, np.zeros(2)), []
+        off = _off_px(self._points, geometry)
         for start, end in zip(self._bounds, self._bounds[1:], strict=False):
             medians.append(min(float(np.median(off[start:end])), MOST_PX))
         return float(np.mean(medians))
@@ -178,6 +173,53 @@ class MatchedPoints:
             repeated = [np.broadcast_to(way, (len(mine), 4, 4)) for way in ways]
             motions[mine] = min(repeated, key=lambda way: some.residual_px(ego_from_camera[mine], way))
         return motions
+
+
+class PointsAtOnce:
+    """Points in the images of two cameras at one time. A wrong rotation between the cameras fits one by chance only.
+
+    Args:
+        drive: its cameras and images.
+        frames: their places in the drive.
+    """
+
+    def __init__(self, drive: Drive, frames: Sequence[int]) -> None:
+        cameras = [reduced(camera, min(WIDTH, camera.width)) for camera in drive.rig.cameras]
+        self._names, groups, rays, focals = (
+            list[tuple[str, str]](),
+            list[int](),
+            list[tuple[Array, Array]](),
+            list[float](),
+        )
+        for index in frames:
+            seen = _seen(drive, index, cameras)
+            for first, second in combinations([camera for camera in cameras if camera.name in seen], 2):
+                both = matched(seen[first.name].features, seen[second.name].features, first, second)
+                rays.append(both)
+                groups += [len(self._names)] * len(both[0])
+                focals += [first.intrinsics[0, 0]] * len(both[0])
+                self._names.append((first.name, second.name))
+        of_a, of_b = (np.concatenate([np.zeros((0, 3)), *(each[side] for each in rays)]) for side in (0, 1))
+        self._points = EpipolarResiduals(np.array(groups, np.int64), of_a, of_b, np.array(focals))
+
+    def fitting(self, ego_from_camera: Mapping[str, Array]) -> int:
+        """The number of points that lie where cameras with these poses (4, 4) see them."""
+        if not self._names:
+            return 0
+        of_a, of_b = (np.stack([ego_from_camera[names[side]] for names in self._names]) for side in (0, 1))
+        stands = np.broadcast_to(np.eye(4), of_a.shape)
+        return int((_off_px(self._points, GroupGeometry(of_a, of_b, stands, np.zeros(2))) < AT_ONCE_PX).sum())
+
+
+def _off_px(points: EpipolarResiduals, geometry: GroupGeometry) -> Array:
+    """(N,) pixels that points are off; those behind a camera, or of cameras at one place, by their whole parallax."""
+    off = np.abs(points.of(geometry)[:, 0])
+    relative = geometry.camera_b_from_camera_a[points.group]
+    turned = np.einsum("nij,nj->ni", relative[:, :3, :3], points.rays_a)
+    parallax = points.focal * np.linalg.norm(np.cross(turned, points.rays_b), axis=-1)
+    behind = (points.depths(geometry) < 0).any(-1) & (parallax > PARALLAX_PX)
+    stays = np.linalg.norm(relative[:, :3, 3], axis=-1) < SHORTEST_WAY_M
+    return np.where(behind | stays | ((turned * points.rays_b).sum(-1) < 0), np.maximum(off, parallax), off)
 
 
 def rotation_seen(pair: CameraPair) -> Array:
