@@ -14,13 +14,16 @@ from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.boxes_table import write_csv
-from bevcli.sequences.open import open_sequence
+from bevcli.sequences.open import DriveView, open_sequence
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import write_kitti
 from bevcli.workshop.formats.labels import WithLabels, _labelled_frames
 from bevcli.workshop.formats.output import NativeWriter
 
 HEAD = "frame,class,x,y,z,length,width,height,yaw"
+DOCUMENTED = LabelOptions(
+    labels_frame="ego", labels_sides="lwh", labels_yaw="x", labels_yaw_unit="radians", labels_z="center"
+)
 
 
 class MadeDrive(MemoryDrive):
@@ -82,9 +85,8 @@ def test_tracks_give_velocities_over_ground(tmp_path: Path) -> None:
             numbers = (*in_ego.centers[box], *in_ego.sizes_lwh[box], in_ego.yaws[box])
             rows.append(",".join([str(place), name, *map(repr, map(float, numbers)), f"track {box}"]))
     path.write_text("\n".join(rows))
-    labelled = WithLabels(drive, path)
+    labelled = WithLabels(drive, path, DOCUMENTED)
     np.testing.assert_allclose(labelled.load(1).ground_truth.velocities, [[4, 0], [0, 0]], atol=1e-6)
-    assert any('are taken to be in the "ego" frame' in note for note in labelled.notes)
 
 
 @pytest.mark.parametrize(
@@ -103,7 +105,7 @@ def test_frames_without_a_row_are_empty_or_unlabelled(
 ) -> None:
     drive, path = MadeDrive(), tmp_path / "labels.csv"
     path.write_text("\n".join([HEAD, *(f"{drive.stamps[place].index},PKW,1,2,0,4,2,1,0" for place in listed)]))
-    labelled = WithLabels(drive, path, LabelOptions(unlisted_frames=unlisted))
+    labelled = WithLabels(drive, path, replace(DOCUMENTED, unlisted_frames=unlisted))
     truths = [labelled.load(place).ground_truth for place in range(4)]
     assert "".join("x" if truth is None else str(len(truth)) for truth in truths) == expected
     assert any(note in each for each in labelled.notes)
@@ -206,7 +208,7 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
 )
 def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    labelled = WithLabels(MadeDrive(), tmp_path / name)
+    labelled = WithLabels(MadeDrive(), tmp_path / name, DOCUMENTED if name == "labels.csv" else LabelOptions())
     assert any("left out: a size of 0 or less" in note for note in labelled.notes)
     boxes = [labelled.load(place).ground_truth for place in range(4)]
     assert all((each.sizes_lwh > 0).all() for each in boxes if each is not None)
@@ -263,12 +265,26 @@ def test_boxes_show_what_a_table_holds(held: dict[str, str], note: str, street: 
 
 
 def test_a_table_that_fits_nothing_is_read_as_stated(street: Drive, tmp_path: Path) -> None:
-    path = tmp_path / "labels.csv"
-    street_table(path, street, frame="lidar")
+    path, few = tmp_path / "labels.csv", DriveView(street, [0, 1])
+    street_table(path, few, frame="lidar")
     with pytest.raises(InputError, match=r"fit no reading .*--labels-frame ego --labels-z center` to read it"):
-        WithLabels(street, path)
-    found = WithLabels(street, path, LabelOptions(labels_frame="ego", labels_z="center"))
+        WithLabels(few, path)
+    found = WithLabels(few, path, LabelOptions(labels_frame="ego", labels_z="center"))
     assert any("what is stated does not fit the boxes" in note for note in found.notes)
+
+
+def test_images_show_what_the_boxes_of_one_frame_do_not(street: Drive, tmp_path: Path) -> None:
+    first, path = DriveView(street, [0]), tmp_path / "labels.csv"
+    street_table(path, first, frame="bev", sides="wlh")
+    head, *lines = path.read_text().splitlines()
+    path.write_text("\n".join([head, *[line for line in lines if ",car," in line][:4]]))
+    with pytest.raises(InputError, match=r"neither boxes nor images tell which it is: .*--labels-yaw"):
+        WithLabels(first, path)
+    found = WithLabels(first, path, LabelOptions(labels_sides="wlh", labels_yaw="x", labels_yaw_unit="radians"))
+    assert any("boxes in the bev frame" in note and "(the images: overlap 0." in note for note in found.notes)
+    truth = first.load(0).ground_truth
+    truth = truth[truth.classes == "car"][:4]
+    np.testing.assert_allclose(found.load(0).ground_truth.to_numpy()[:, :7], truth.to_numpy()[:, :7], atol=1e-6)
 
 
 CLASSES = ("Car", "TRUCK", "Tricycle", "lorry", "pedestrian")

@@ -26,8 +26,7 @@ def convert(
     Image files are copied byte for byte; images of a video become PNG. Ego-motion and ground truth are kept.
     Maps and lines of the map go into sequence folders only; a note says where they are left out.
     """
-    from bevcli.workshop.formats.convert import Converted, to_convert, write_drive
-    from bevcli.workshop.formats.labels import with_labels
+    from bevcli.workshop.formats.convert import Converted, to_convert, with_labels, write_drive
 
     drive = with_labels(open_with_bar(input, to_convert(input, out, options), format_options), labels)
     with Progress(len(drive.stamps), "frames", drive.notes) as progress:

@@ -22,7 +22,7 @@ from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import read_recording
 from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
 from bevcli.workshop.formats.kitti import export_kitti
-from bevcli.workshop.formats.labels import with_labels
+from bevcli.workshop.formats.labels import WithLabels
 from bevcli.workshop.formats.nuscenes_output import NuScenesWriter, write_submission
 from bevcli.workshop.formats.output import DriveWriter, NativeWriter
 from bevcli.writing import check_output
@@ -69,6 +69,11 @@ def convert(source: str | Path, out: str | Path, **options: Any) -> Converted:
     drive = open_sequence(source, to_convert(Path(source), Path(out), common), **format_options)
     converted: Converted = deque[Any](write_drive(with_labels(drive, labels), Path(out), written), maxlen=1).pop()
     return converted
+
+
+def with_labels(drive: Drive, options: LabelOptions) -> Drive:
+    """The drive with the boxes of the file of labels, if one is given. Raises InputError as `WithLabels`."""
+    return drive if options.labels is None else WithLabels(drive, options.labels, options)
 
 
 def to_convert(source: Path, out: Path, options: InputOptions) -> InputOptions:

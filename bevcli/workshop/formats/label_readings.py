@@ -1,6 +1,7 @@
-"""The contents of a file of labels, and what they are, decided by the boxes: sizes of classes, the road, the motion.
+"""The contents of a file of labels, and what they are, decided by the boxes and by the images.
 
-What stands stays where it is in the world, boxes stand on the road, and vehicles drive ahead.
+What stands stays where it is in the world, boxes stand on the road, and vehicles drive ahead. Of the readings that this
+leaves, one is believed if its boxes lie on the objects that a detector sees in the images, and those of others do not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, inverse, wrap_angle
-from bevcli.sequences.files.readings import Reading, differing, question
+from bevcli.sequences.files.readings import MOST_NAMED, Reading, differing, question
 
 # Usual length, width and height by words in the names of classes, metres; None for classes of other sizes.
 SIZES = {
@@ -36,12 +37,26 @@ YAWS = {  # -> in words; sign and offset that make it counter-clockwise from x, 
 SOUND_PERCENT, SOUND_M, SOUND_DEG = 22.0, 0.35, 15.0  # largest residuals of an unusual reading that is taken
 UNFIT = 2.5  # times these: the usual one is refused
 CLEAR, CLEAR_SOUND = 2.0, 0.3  # factor, and addition as a share of these, by which all other residuals are larger
-FEWEST = 5  # boxes that tell
+FEWEST = 5  # boxes that tell the road and the yaws
+SAME, COMPARED = np.array([0.02] * 6 + [np.radians(1)]), 200  # metres and radians; boxes that are compared
+OVERLAPS, SOUND_OVERLAP = (
+    0.2,
+    0.35,
+)  # of a box and an object in an image: they belong together; mean of a reading that fits
+CLEARLY, CLEARLY_USUAL = (
+    3.0,
+    1.5,
+)  # standard errors by which another reading is worse than the best, and than the usual one
+SPREAD = 0.2  # of overlaps, where one object was seen
 LARGEST_RADIANS, LARGEST_DEGREES = 6.5, 361.0  # a little more than a turn
 LONGEST_M, USUAL_M = 300.0, 30.0  # of the longest box, and of the median one; a train has 200 m
 IN_CENTIMETRES = 1000.0  # a smaller median is that of boxes in centimetres
 LONG_M = 1.7  # of classes that drive ahead
 NEAR_M, FAR_M = 40.0, 300.0  # of boxes that tell the road; of boxes that are not around the vehicle
+TURNED_RAD, BY_CHANCE = 0.5, 4.6  # yaws that are not near 0; Rayleigh's statistic that chance exceeds once in a hundred
+ASIDE = (
+    "neither boxes nor images tell the bev frame from others on the vehicle: pass `--labels-frame bev` if it is that"
+)
 WAY_M, DRIVEN_M = 1.0, (0.5, 8.0)  # between two frames: of the vehicle, of driving objects
 STANDING_SHARE = 30  # percentage of the boxes that stand
 ALLOWED_M = 0.5  # by which standing boxes move, and by which boxes leave the plane of the road
@@ -77,10 +92,11 @@ class Labels:
 
 @dataclass(frozen=True)
 class LabelReading(Reading):
-    """What a table of labels may hold, and how far its boxes are from that; infinite where they do not tell."""
+    """What a table of labels may hold, and how far its boxes are from that."""
 
-    residual: float = np.inf
-    is_sure: bool = True  # False where the boxes of another one may look the same
+    residual: float = np.inf  # of what was looked at last; infinite where it does not tell
+    doubt: str = ""  # why it is not believed unless the images show it
+    notes: tuple[str, ...] = ()  # what shows it
 
     def words(self, names: Sequence[str] = ()) -> str:
         """It in words."""
@@ -92,6 +108,10 @@ class LabelReading(Reading):
             "labels_yaw_unit": "yaws in {}".format,
         }
         return ", ".join(words[name](value) for name, value in self.states.items() if not names or name in names)
+
+    def with_more(self, states: Mapping[str, str], residual: float, rank: int, doubt: str = "") -> "LabelReading":
+        """It, with further states."""
+        return LabelReading({**self.states, **states}, residual, self.doubt or doubt, self.notes, rank=self.rank + rank)
 
 
 @dataclass(frozen=True)
@@ -139,27 +159,134 @@ def check_labels(path: Path, labels: Labels) -> None:
         raise InputError(f"{path}: has a yaw of {largest:g} (expected radians, or degrees up to 360): correct it")
 
 
-def decide(
-    path: Path, frames: Sequence[PlacedBoxes], stated: Mapping[str, str]
-) -> tuple[Mapping[str, str], tuple[str, ...]]:
-    """What a table holds, by its boxes, as options and their values; and notes on what is not usual.
+def fitting(path: Path, frames: Sequence[PlacedBoxes], stated: Mapping[str, str]) -> list[LabelReading]:
+    """The readings of a table that its boxes leave, the usual one first. Of those that mean the same, the first.
 
     Args:
         path: the file.
         frames: of the drive, in order; those with boxes.
-        stated: what the user and the file state, in the same way.
+        stated: what the user and the file state, as options and their values.
 
-    Raises InputError where the boxes fit no reading, or several: it names the options that decide.
+    Raises InputError where the boxes fit no reading: it names the options that decide.
     """
-    states, notes = dict[str, str](), []
-    for sound, unit, ask in (
-        (SOUND_PERCENT, "% off usual sizes", _sides),
-        (SOUND_M, "m", _places),
-        (SOUND_DEG, "degrees", _yaws),
+    left = [LabelReading({})]
+    for names, sound, unit, ask in (
+        (("labels_sides",), SOUND_PERCENT, "% off usual sizes", _sides),
+        (("labels_frame", "labels_z"), SOUND_M, "m", _places),
+        (("labels_yaw", "labels_yaw_unit"), SOUND_DEG, "degrees", _yaws),
     ):
-        chosen, note = _chosen(path, list(ask(frames, states)), stated, sound, unit)
-        states |= chosen
-        notes += [note] if note else []
+        readings = [reading for before in left for reading in ask(frames, before)]
+        left = _left(path, readings, names, stated, sound, unit)
+    if "labels_frame" in stated:
+        left = [replace(each, doubt="" if each.doubt == ASIDE else each.doubt) for each in left]
+    return _unlike(frames, sorted(left, key=lambda each: each.rank))
+
+
+def _left(
+    path: Path, readings: Sequence[LabelReading], names: Sequence[str], stated: Mapping[str, str], sound: float,
+    unit: str,
+) -> list[LabelReading]:  # fmt: skip
+    """The readings that differ in `names`, without those that are not stated and those that are clearly worse."""
+    possible = [
+        each for each in readings if all(stated.get(name, value) == value for name, value in each.states.items())
+    ]
+    usual, best, fitting = possible[0], *(min(some, key=lambda each: each.residual) for some in (possible, readings))
+    if not np.isfinite(best.residual) and (best is usual or not np.isfinite(fitting.residual)):
+        return possible
+    left = [each for each in possible if each.residual <= CLEAR * best.residual + CLEAR_SOUND * sound]
+    by = f"{usual.residual:.1f} {unit}" if np.isfinite(usual.residual) else "far away"
+    if set(names) <= set(stated):
+        near = min(UNFIT * sound, CLEAR * fitting.residual + CLEAR_SOUND * sound)
+        if best.residual <= max(sound, near):
+            return left
+        differ = differing([usual, fitting])
+        fits = f"; `{fitting.flags(differ)}` fits ({fitting.residual:.1f} {unit})" if fitting.residual <= sound else ""
+        note = f"what is stated does not fit the boxes ({usual.words(differ or names)}: {by}){fits}"
+        return [replace(each, notes=(*each.notes, note)) for each in possible]
+    if usual in left and usual.residual <= UNFIT * sound:
+        return left
+    if best.residual > sound:
+        why = f"the boxes fit no reading ({usual.words(names)}: {by}), and the images show none"
+        doubt = f"{why}: correct the file, or pass `{usual.flags(names)}` to read it so"
+        return [replace(each, doubt=each.doubt or doubt) for each in possible]
+    differ = [name for name in differing([usual, *left]) if name in names]
+    return [replace(each, notes=(*each.notes, _shown(each, usual, differ, unit, by))) for each in left]
+
+
+def _shown(reading: LabelReading, usual: LabelReading, names: Sequence[str], unit: str, by: str) -> str:
+    return f"{reading.words(names)} (the boxes: {reading.residual:.1f} {unit}; {usual.words(names)}: {by})"
+
+
+def _unlike(frames: Sequence[PlacedBoxes], readings: Sequence[LabelReading]) -> list[LabelReading]:
+    """The readings, without those that put all boxes where an earlier one has them."""
+    kept, places = list[LabelReading](), np.zeros((0, COMPARED, 7))
+    for reading in readings if len(readings) > 1 else ():
+        boxes = Boxes3D.concatenate(frame.read_as(reading.states) for frame in frames)
+        boxes = boxes[np.linspace(0, len(boxes) - 1, COMPARED).astype(int)] if len(boxes) else boxes
+        place = np.resize(np.concatenate([boxes.centers, boxes.sizes_lwh, boxes.yaws[:, None]], axis=1), (COMPARED, 7))
+        off = np.abs(places - place)
+        off[..., 6] = np.abs(wrap_angle(off[..., 6]))
+        if not (off <= SAME).all(axis=(1, 2)).any():
+            kept, places = [*kept, reading], np.concatenate([places, place[None]])
+    return kept or list(readings)
+
+
+def shown_by_images(readings: Sequence[LabelReading], overlaps: Array, count: int) -> list[LabelReading]:
+    """The readings that fit the images, in their order; all where the images do not tell.
+
+    Args:
+        readings: the usual one first.
+        overlaps: (R, D) of the boxes of each reading with D objects in the images, 0 to 1.
+        count: of the boxes in the frames of these images.
+    """
+    best = int(overlaps.sum(axis=1).argmax())
+    if overlaps[best].sum() < max(SOUND_OVERLAP * min(overlaps.shape[1], count / 2), SOUND_OVERLAP):
+        return list(readings)
+    kept = [index for index, of in enumerate(overlaps) if _clearness(overlaps[best], of) < CLEARLY]
+    if 0 in kept:
+        kept = [index for index in kept if not index or _clearness(overlaps[0], overlaps[index]) < CLEARLY_USUAL]
+    fits, others = overlaps.mean(axis=1), [index for index in range(len(readings)) if index not in kept]
+    if not others:
+        return [replace(reading, doubt="") for reading in readings]
+    other = readings[max(others, key=lambda index: float(fits[index]))]
+    fit, found = float(max(fits[others])), []
+    for reading, own in zip([readings[index] for index in kept], fits[kept], strict=True):
+        names = differing([reading, other])
+        told = [name for name, value in reading.states.items() if name in names or value != USUAL[name]]
+        note = f"{reading.words(told)} (the images: overlap {own:.2f}; {other.words(names)}: {fit:.2f})"
+        found.append(replace(reading, notes=(*reading.notes, note), doubt=""))
+    return found
+
+
+def _clearness(one: Array, other: Array) -> float:
+    """Mean difference of overlaps with objects, in standard errors."""
+    differences = (one - other)[np.maximum(one, other) > OVERLAPS]
+    count, mean = len(differences), float(differences.sum()) / max(len(differences), 1)
+    spread = np.sqrt((np.square(differences - mean).sum() + SPREAD**2) / max(count, 1))
+    return mean / float(spread) * np.sqrt(count)
+
+
+def decided(
+    path: Path, frames: Sequence[PlacedBoxes], left: Sequence[LabelReading], stated: Mapping[str, str]
+) -> tuple[Mapping[str, str], tuple[str, ...]]:
+    """What a table holds, as options and their values; and notes on what is not stated. left: at least one reading.
+
+    Raises InputError where several readings are left: it names the options that decide.
+    """
+    chosen = left[0]
+    if chosen.doubt:
+        raise InputError(f"{path}: {chosen.doubt}")
+    if len(left) > 1:
+        names = differing(left)
+        why = "neither boxes nor images tell which it is"
+        if len(left) <= MOST_NAMED:
+            raise question(path, why, left)
+        options = ", ".join(f"`{name}` (`--{name.replace('_', '-')}`)" for name in names)
+        raise InputError(
+            f"{path}: has {len(left)} readings, and {why}: state what it holds by {options}; it is "
+            f"`{LabelReading(USUAL).flags(names)}` where it is as documented"
+        )
+    states, notes = chosen.states, list(chosen.notes)
     if states["labels_yaw_unit"] == "degrees" and "labels_yaw_unit" not in stated:
         notes.append(f"the yaws, of up to {_largest_yaw(frames):.0f}, are taken to be in degrees")
     if states["labels_frame"] == "ego" and "labels_frame" not in stated:
@@ -167,50 +294,19 @@ def decide(
     return states, tuple(notes)
 
 
-def _chosen(
-    path: Path, readings: Sequence[LabelReading], stated: Mapping[str, str], sound: float, unit: str
-) -> tuple[Mapping[str, str], str]:
-    """The states of the reading that is stated, usual or clearly better than all others, and a note on it."""
-    possible = [
-        each for each in readings if all(stated.get(name, value) == value for name, value in each.states.items())
-    ]
-    usual, best = possible[0], min(possible, key=lambda each: each.residual)
-    if not np.isfinite([each.residual for each in readings]).any():
-        return usual.states, ""
-    limit = CLEAR * best.residual + CLEAR_SOUND * sound
-    left = [each for each in possible if each.residual <= limit]
-    if usual in left and usual.residual <= UNFIT * sound:
-        return usual.states, ""
-    fitting = min(readings, key=lambda each: each.residual)
-    names = differing([usual, *left, fitting])
-    by = f"{usual.residual:.1f} {unit}" if np.isfinite(usual.residual) else "far away"
-    off = f"{usual.words(names)}: {by}"
-    if len(possible) == 1 or set(usual.states) <= set(stated):
-        fits = f"; `{fitting.flags(names)}` fits ({fitting.residual:.1f} {unit})" if fitting.residual <= sound else ""
-        return usual.states, f"what is stated does not fit the boxes ({off}){fits}"
-    if best.residual > sound:
-        raise InputError(
-            f"{path}: the boxes fit no reading ({usual.words()}: {by}): correct the file, or "
-            f"pass `{usual.flags(list(usual.states))}` to read it so"
-        )
-    left = [each for each in left if each.rank == min(one.rank for one in left)]
-    if len(left) > 1 or not left[0].is_sure:
-        raise question(path, f"the boxes do not tell which it is ({off})", [*left, usual])
-    return left[0].states, f"{left[0].words(names)} (the boxes: {left[0].residual:.1f} {unit}; {off})"
-
-
-def _sides(frames: Sequence[PlacedBoxes], _: Mapping[str, str]) -> Iterator[LabelReading]:
-    """Orders of the sides, by the mean difference to the usual sizes of the classes, percent."""
+def _sides(frames: Sequence[PlacedBoxes], before: LabelReading) -> Iterator[LabelReading]:
+    """Orders of the sides, by the mean difference to the usual shapes of the classes, percent."""
     boxes = Boxes3D.concatenate(frame.boxes for frame in frames)
     usual = np.array([_usual_size(name) or (np.nan,) * 3 for name in boxes.classes]).reshape(-1, 3)
     lengths = np.unique(usual[np.isfinite(usual[:, 0]), 0])  # one of each class
     readings = []
     for sides in map("".join, permutations("lwh")):
-        off = np.abs(np.log(read_as({"labels_sides": sides}, boxes).sizes_lwh / usual)).mean(axis=1)
+        scales = np.log(read_as({"labels_sides": sides}, boxes).sizes_lwh / usual)
+        off = np.abs(scales - scales.mean(axis=1, keepdims=True)).mean(axis=1)
         by_class = [off[usual[:, 0] == length].mean() for length in lengths]
-        residual = 100 * float(np.expm1(np.mean(by_class))) if np.isfinite(off).sum() >= FEWEST else np.inf
+        residual = 100 * float(np.expm1(np.mean(by_class))) if len(lengths) else np.inf
         rank = sum(one != other for one, other in zip(sides, "lwh", strict=True))
-        readings.append(LabelReading({"labels_sides": sides}, residual, rank=rank))
+        readings.append(before.with_more({"labels_sides": sides}, residual, rank))
     tell = min(each.residual for each in readings) <= SOUND_PERCENT  # names of classes may be others' words
     yield from readings if tell else (replace(each, residual=np.inf) for each in readings)
 
@@ -220,11 +316,11 @@ def _usual_size(name: str) -> tuple[float, float, float] | None:
     return next((size for words, size in SIZES.items() if any(word in lower for word in words)), None)
 
 
-def _places(frames: Sequence[PlacedBoxes], states: Mapping[str, str]) -> Iterator[LabelReading]:
+def _places(frames: Sequence[PlacedBoxes], before: LabelReading) -> Iterator[LabelReading]:
     """Frames of reference and meanings of z, by the road, and by what stands if the vehicle moves."""
     for frame, z in product(FRAMES, ("center", "bottom")):
         reading = {"labels_frame": frame, "labels_z": z}
-        world = [each.read_as({**states, **reading}) for each in frames]
+        world = [each.read_as({**before.states, **reading}) for each in frames]
         around = Boxes3D.concatenate(
             boxes.transformed(inverse(each.ego)) for boxes, each in zip(world, frames, strict=True)
         )
@@ -241,24 +337,35 @@ def _places(frames: Sequence[PlacedBoxes], states: Mapping[str, str]) -> Iterato
             uneven_m = float(np.median(np.abs(bottoms - height)))
             moved_m = float(np.percentile(moved, STANDING_SHARE)) if len(moved) >= FEWEST else 0.0
             residual = abs(height) + max(uneven_m - ALLOWED_M, 0.0) + max(moved_m - ALLOWED_M, 0.0)
-        is_sure = frame != "bev" or len(moved) >= FEWEST  # a frame with other axes may look the same
-        yield LabelReading(reading, residual, is_sure, rank=(frame != FRAMES[0]) + (z == "bottom"))
+        doubt = "" if frame != "bev" or len(moved) >= FEWEST else ASIDE
+        yield before.with_more(reading, residual, (frame != FRAMES[0]) + (z == "bottom"), doubt)
 
 
-def _yaws(frames: Sequence[PlacedBoxes], states: Mapping[str, str]) -> Iterator[LabelReading]:
+def _yaws(frames: Sequence[PlacedBoxes], before: LabelReading) -> Iterator[LabelReading]:
     """Meanings of yaw: vehicles drive ahead."""
     units = ["degrees", "radians"] if _largest_yaw(frames) > LARGEST_RADIANS else ["radians", "degrees"]
+    shown = units[:1] if _are_at_right_angles(frames, units[0]) else units
     for unit, name in product(units, YAWS):
         reading = {"labels_yaw": name, "labels_yaw_unit": unit}
         off = []
-        for _, before, after in _successive(frames, [each.read_as({**states, **reading}) for each in frames]):
-            x, y, _ = (after.centers - before.centers).T
-            is_long = np.array([(_usual_size(each) or (0.0,))[0] >= LONG_M for each in before.classes], dtype=bool)
+        for _, earlier, later in _successive(frames, [each.read_as({**before.states, **reading}) for each in frames]):
+            x, y, _ = (later.centers - earlier.centers).T
+            is_long = np.array([(_usual_size(each) or (0.0,))[0] >= LONG_M for each in earlier.classes], dtype=bool)
             drives = is_long & (np.hypot(x, y) >= DRIVEN_M[0]) & (np.hypot(x, y) <= DRIVEN_M[1])
-            off.append(np.abs(wrap_angle(np.arctan2(y, x) - before.yaws))[drives])
+            off.append(np.abs(wrap_angle(np.arctan2(y, x) - earlier.yaws))[drives])
         angles = np.concatenate([*off, np.zeros(0)])
         residual = float(np.degrees(np.median(angles))) if len(angles) >= FEWEST else np.inf
-        yield LabelReading(reading, residual, rank=(unit != units[0]) + (name != "x"))
+        if unit in shown:
+            yield before.with_more(reading, residual, (unit != units[0]) + (name != "x"))
+
+
+def _are_at_right_angles(frames: Sequence[PlacedBoxes], unit: str) -> bool:
+    """True where vehicles are parallel and at right angles to each other, with yaws in this unit, and not by chance."""
+    boxes = Boxes3D.concatenate(frame.boxes for frame in frames)
+    yaws = boxes.yaws[[(_usual_size(each) or (0.0,))[0] >= LONG_M for each in boxes.classes]]
+    yaws = wrap_angle(np.radians(yaws) if unit == "degrees" else yaws)
+    turned = yaws[np.abs(yaws) > TURNED_RAD]
+    return len(turned) >= FEWEST and bool(np.square(np.abs(np.exp(4j * turned).mean())) * len(turned) > BY_CHANCE)
 
 
 def _largest_yaw(frames: Sequence[PlacedBoxes]) -> float:

@@ -24,11 +24,23 @@ from bevcli.parsing.documents import CsvRow
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted, name_of
 from bevcli.sequences.files.boxes_file import count_classes
+from bevcli.sequences.files.boxes_table import COLUMNS
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
 from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
-from bevcli.workshop.formats.label_readings import USUAL, LabelledFrame, Labels, PlacedBoxes, check_labels, decide
+from bevcli.workshop.formats.label_readings import (
+    USUAL,
+    LabelledFrame,
+    LabelReading,
+    Labels,
+    PlacedBoxes,
+    check_labels,
+    decided,
+    fitting,
+    shown_by_images,
+)
 
+MOST_FRAMES, MOST_PROJECTED = 4, 15_000  # frames whose images are looked at; boxes of all readings in them
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
 
@@ -47,11 +59,6 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     labels = replace(labels, frames=frames, notes=(*labels.notes, *note))
     check_labels(path, labels)
     return labels
-
-
-def with_labels(drive: Drive, options: LabelOptions) -> Drive:
-    """The drive with the boxes of the file of labels, if one is given. Raises InputError as `WithLabels`."""
-    return drive if options.labels is None else WithLabels(drive, options.labels, options)
 
 
 class WithLabels(DerivedDrive):
@@ -141,8 +148,30 @@ def _in_world(
     stated = {**labels.states, **stated}
     if stated.get("labels_frame") == "world" and not sequence.has_ego_motion:
         raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
-    states, notes = decide(path, [placed[index] for index in sorted(placed)], stated)
+    frames = [placed[index] for index in sorted(placed)]
+    left = fitting(path, frames, stated)
+    if len(left) > 1 or left[0].doubt:
+        left = _shown_by_images(sequence, placed, left)
+    states, notes = decided(path, frames, left, stated)
     return {index: each.read_as(states) for index, each in placed.items()}, notes
+
+
+def _shown_by_images(
+    sequence: Drive, placed: Mapping[int, PlacedBoxes], readings: Sequence[LabelReading]
+) -> list[LabelReading]:
+    """The readings that fit the images of some frames, by a detector of objects in images."""
+    from bevcli.workshop.trust.witness import overlaps_seen
+
+    indices = [index for index in sorted(placed) if len(placed[index].boxes)]
+    many = len(readings) * sum(len(placed[index].boxes) for index in indices)
+    count = min(MOST_FRAMES, len(indices), max(1, MOST_PROJECTED * len(indices) // max(many, 1)))
+    looked_at = [indices[place] for place in np.linspace(0, len(indices) - 1, count).astype(int)]
+    overlaps = [np.zeros((len(readings), 0))]
+    for index in looked_at:
+        boxes = [placed[index].read_as(each.states) for each in readings]
+        overlaps.append(overlaps_seen(sequence.load(index), boxes))
+    boxes_count = sum(len(placed[index].boxes) for index in looked_at)
+    return shown_by_images(readings, np.concatenate(overlaps, axis=1), boxes_count)
 
 
 def _with_velocities(sequence: Drive, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
@@ -220,7 +249,8 @@ def read_csv_labels(path: Path) -> Labels:
     notes += [f"columns without meaning here are ignored: {', '.join(others)}"] if others else []
     moments, boxes = _moments(path, rows), _boxes(rows, columns)
     frames = tuple(LabelledFrame(*moment, boxes[numbers]) for moment, numbers in moments.items())
-    states = {"labels_frame": _frame_of_reference(path, rows)} if "frame_of_reference" in columns else {}
+    states = dict(USUAL) if set(COLUMNS) <= set(columns) else {}  # bevcli wrote it
+    states |= {"labels_frame": _frame_of_reference(path, rows)} if "frame_of_reference" in columns else {}
     return Labels(states, frames, lists_empty=False, notes=tuple(notes))
 
 

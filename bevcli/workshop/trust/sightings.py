@@ -13,7 +13,7 @@ from bevcli.geometry.object_classes import ObjectClass
 from bevcli.geometry.transforms import Array, apply, inverse
 
 GROUPS = ("vehicles", "people", "cycles")
-_OF_COCO = {"car": 0, "truck": 0, "bus": 0, "person": 1, "bicycle": 2, "motorcycle": 2}
+OF_COCO = {"car": 0, "truck": 0, "bus": 0, "person": 1, "bicycle": 2, "motorcycle": 2}
 _OF_KIND = {"vehicle": 0, "pedestrian": 1, "cycle": 2}  # of the attributes of a class of objects
 PARTNER = 0.3  # overlap from which on two boxes explain each other
 APART_M = np.array([0.5, 1, 2, 4])  # as `bevcli eval` matches boxes
@@ -89,7 +89,7 @@ def unexplained(
     groups, lonely = groups_of(boxes, classes), {}
     for name, in_image in seen.items():
         pose = frame.world_from_ego_at[name].matrix @ frame.rig[name].ego_from_camera
-        kinds = np.array([_OF_COCO.get(kind, -1) for kind in in_image.classes.tolist()], dtype=int)
+        kinds = np.array([OF_COCO.get(kind, -1) for kind in in_image.classes.tolist()], dtype=int)
         overlap = overlaps(projected(boxes, inverse(pose), frame.rig[name]), in_image.corners)
         best = (overlap * (groups[:, None] == kinds)).max(axis=0, initial=0)
         lonely[name] = (kinds >= 0) & (in_image.scores >= SURE) & (best < PARTNER)
@@ -119,8 +119,8 @@ def _of_camera(frame: Frame, camera: Camera, boxes: Boxes3D, groups: NDArray[np.
     is_counted &= covered.max(axis=1, initial=0) < HIDDEN
     scores = np.ones(len(boxes)) if boxes.scores is None else boxes.scores
 
-    known = np.array([name in _OF_COCO for name in seen.classes.tolist()], dtype=bool) & (seen.scores >= POSSIBLE)
-    kinds = np.array([_OF_COCO[name] for name in seen.classes[known].tolist()], dtype=int)
+    known = np.array([name in OF_COCO for name in seen.classes.tolist()], dtype=bool) & (seen.scores >= POSSIBLE)
+    kinds = np.array([OF_COCO[name] for name in seen.classes[known].tolist()], dtype=int)
     double = overlaps(seen.corners[known], seen.corners[known]) * (kinds[:, None] == kinds) > DOUBLE
     single = ~np.triu(double, 1).any(axis=0)  # the better one of two, as they come by falling score
     corners, certainties, kinds = seen.corners[known][single], seen.scores[known][single], kinds[single]

@@ -3,6 +3,7 @@
 Its weights are those of the detector in the model `photographs`. That model's own boxes in images are these.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,14 @@ import numpy as np
 import torch
 
 from bevcli.frame import Frame
-from bevcli.geometry.boxes import Boxes2D
+from bevcli.geometry.boxes import Boxes2D, Boxes3D
+from bevcli.geometry.transforms import Array, inverse
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.model.step import model_inputs
 from bevcli.parsing.documents import CsvRow, csv_rows
 from bevcli.sequences.files.boxes_table import IMAGE_COLUMNS
-from bevcli.workshop.trust.sightings import Seen
+from bevcli.workshop.trust.sightings import LEAST_PX, OF_COCO, SURE, Seen, overlaps, projected
 
 
 class Witness:
@@ -40,6 +42,23 @@ class Witness:
 
 
 load_witness = cache(Witness)
+
+
+def overlaps_seen(frame: Frame, readings: Sequence[Boxes3D]) -> Array:
+    """(R, D) the largest overlap of D objects in the images of a frame with a box, of each of R sets of boxes.
+
+    readings: in the world frame.
+    """
+    found = [np.zeros((len(readings), 0))]
+    for name, objects in load_witness().seen(frame).items():
+        camera, height = frame.rig[name], objects.corners[:, 3] - objects.corners[:, 1]
+        is_sure = (objects.scores >= SURE) & (height >= LEAST_PX) & [each in OF_COCO for each in objects.classes]
+        camera_from_world = inverse(frame.world_from_ego_at[name].matrix @ camera.ego_from_camera)
+        edge = np.tile([camera.width - 1, camera.height - 1], 2)
+        shown = [np.clip(projected(boxes, camera_from_world, camera), 0, edge) for boxes in readings]
+        best = [overlaps(each, objects.corners[is_sure]).max(axis=0, initial=0) for each in shown]
+        found.append(np.stack(best))
+    return np.concatenate(found, axis=1)
 
 
 def seen_in_run(path: Path) -> dict[tuple[int, int], dict[str, Boxes2D]]:
