@@ -357,6 +357,7 @@ def simulated(name: str, monkeypatch: Any, sample: Callable[..., None]) -> Itera
     monkeypatch.setattr("bevcli.model.upload.pinned", pinned)
     monkeypatch.setattr("bevcli.inference.pipeline.pinned_place", lambda x: pinned(torch.empty(x.shape, dtype=x.dtype)))
     monkeypatch.setattr("bevcli.inference.runner.read_ahead", in_turn)
+    monkeypatch.setattr("bevcli.runs.run_into_folder.write_behind", lambda items, write: in_turn(write, items))
     monkeypatch.setattr(torch.mps, "synchronize", lambda: None)
     if device.device.type == "cuda":
         _provide_cuda(device, monkeypatch)
