@@ -3,12 +3,14 @@
 import contextlib
 import io
 import shutil
+import time
 from pathlib import Path
 
 import pytest
 from command_line import command
 
-from bevcli.cli.progress import Progress, duration
+from bevcli.cli import progress as of_commands
+from bevcli.cli.progress import Progress, duration, opening
 from bevcli.config import load_config
 from bevcli.errors import ConfigError, InputError
 from bevcli.printing import LONGEST_MESSAGE, counted, one_line, print_note, say
@@ -134,3 +136,17 @@ def test_a_table_in_a_note_keeps_its_rows_and_nothing_else_makes_a_line(capsys):
         "  CAM  /cam/image",
         "note: a name\\nerror: forged",
     ]
+
+
+def test_an_input_that_opens_slowly_is_named_until_something_else_tells(capsys, monkeypatch):
+    monkeypatch.setattr(of_commands, "OPENING_S", 0.01)
+    printed = ""
+    with opening(Path("my_drive")) as told:
+        while "opening my_drive, 0 s so far\n" not in printed:
+            time.sleep(0.005)
+            printed += capsys.readouterr().err
+        told.set()
+    with opening(Path("quick")) as told:
+        told.set()
+    time.sleep(0.05)
+    assert "quick" not in capsys.readouterr().err

@@ -8,6 +8,7 @@ import typer
 
 import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
+from bevcli.cli.progress import opening
 from bevcli.errors import InputError
 from bevcli.options import Option, defaults, named
 from bevcli.printing import say
@@ -124,9 +125,10 @@ def project_debug(
     drive_options = {name: value for name, value in format_options.items() if value not in (None, {})}
     if options.sequence is not None and "calibration" in drive_options:
         raise InputError("--calibration and --sequence exclude each other: pass the drive, and its --calibration")
-    check = bevcli.check_calibration(
-        input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
-    )
+    with opening(options.sequence or input):
+        check = bevcli.check_calibration(
+            input, options.sequence, options.frame, allow_outside=source.allow_outside, **drive_options
+        )
     if options.motion and not check.errors:
         from bevcli.workshop.calibration.in_turn import check_motion
 

@@ -3,9 +3,10 @@
 import os
 import re
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
@@ -28,6 +29,7 @@ T = TypeVar("T")
 LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
+OPENING_S = 8.0  # of a drive that is opened, until a line says so
 STOPPED = 130  # exit code of a download that Ctrl-C ends
 MB = 1_000_000
 Part = TypeVar("Part")
@@ -133,10 +135,36 @@ def _bar(stream: TextIO) -> "rich.progress.Progress":
 
 
 def open_with_bar(path: Path, options: "InputOptions", format_options: Mapping[str, Any]) -> "Drive":
-    """Open a drive, with a bar where the option `odometry` measures its motion."""
+    """Open a drive, with a bar where the option `odometry` measures its motion, and lines where all else takes long."""
     from bevcli.sequences.open import open_steps
 
-    return last_of_steps(open_steps(path, options, **format_options))
+    with opening(path) as told:
+        return last_of_steps(_telling(open_steps(path, options, **format_options), told))
+
+
+@contextmanager
+def opening(path: Path) -> Iterator[threading.Event]:
+    """Print that an input is being opened after OPENING_S, then after ever longer times, until the event is set."""
+    told = threading.Event()
+    threading.Thread(target=_tell_opening, args=(path, told), daemon=True).start()
+    try:
+        yield told
+    finally:
+        told.set()
+
+
+def _tell_opening(path: Path, told: threading.Event) -> None:
+    started, silence = time.perf_counter(), OPENING_S
+    while not told.wait(silence):
+        say(f"opening {path}, {duration(time.perf_counter() - started)} so far", err=True)
+        silence *= 2
+
+
+def _telling(steps: Iterable[T], told: threading.Event) -> Iterator[T]:
+    """The steps, which set the event."""
+    for step in steps:
+        told.set()
+        yield step
 
 
 def last_of_steps(steps: Iterable[tuple[int, int] | T]) -> T:

@@ -4,9 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
-from bevcli.cli.progress import Progress
+from bevcli.cli.progress import Progress, open_with_bar
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.calibration import CalibrateOptions, CalibrateOutputOptions
@@ -36,7 +35,7 @@ def calibrate(
     if source.odometry:
         count, measure = in_turn.ALL_STEPS, in_turn.calibrate_in_turn
     input_options = replace(source, odometry=False, ego_motion="measured" if source.odometry else "optional")
-    drive = bevcli.open_sequence(sequence, input_options, ground_truth=False, **format_options)
+    drive = open_with_bar(sequence, replace(input_options, ground_truth=False), format_options)
     out = output.out or Path("runs") / f"{drive.name}-calibrate"
     check_output(out / "calibration.json", sequence / "calibration.json")
     with Progress(count, "steps", drive.notes) as progress:

@@ -56,6 +56,7 @@ from bevcli.workshop.formats.pose_table import (
 
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
+UNIT_ROWS = 50_000  # at the start, and the last one, whose times tell the unit
 _DIGITS = re.compile(r"\d{1,18}(?:\.\d{0,18})?", re.ASCII)  # a time with all of its digits
 POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
 ANGLES = ("vector", "radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
@@ -243,8 +244,9 @@ def _decimal(row: CsvRow) -> Decimal:
 
 def _unit(table: Table, positions: Array, drive: DrivePoses) -> TimeKind:
     """The unit of times without one: rows and speeds that can be, the frames covered, times since 1970."""
-    units, rough = list(UNITS_NS), np.fromiter(_exact(table), np.float64, len(table))
-    durations, lengths = np.diff(rough), np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    rows = np.unique([*range(min(len(table), UNIT_ROWS)), len(table) - 1])
+    units, rough = list(UNITS_NS), np.fromiter(_exact(replace(table, spans=table.spans[rows])), np.float64, len(rows))
+    durations, lengths = np.diff(rough), np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)
     if len(durations) and (durations > 0).any():
         period = float(np.median(durations[durations > 0])) / 1e9
         speed = float(np.median(lengths[durations > 0] / durations[durations > 0])) * 1e9

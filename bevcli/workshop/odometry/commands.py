@@ -4,9 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import bevcli
 from bevcli.cli.bridge import FormatValues, InputDrive, Json, Part
-from bevcli.cli.progress import Progress
+from bevcli.cli.progress import Progress, open_with_bar
 from bevcli.printing import say
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.odometry import OdometryOptions, OdometryOutputOptions
@@ -34,7 +33,7 @@ def odometry(
     from bevcli.workshop.odometry import compare, measure, picture, report
 
     input_options = replace(source, ego_motion="measured")
-    opened = bevcli.open_sequence(sequence, input_options, ground_truth=False, **format_options)
+    opened = open_with_bar(sequence, replace(input_options, ground_truth=False), format_options)
     drive = picture.WatchedDrive(opened if source.rate_hz or source.every else report.at_most_rate(opened))
     out = output.out or Path("runs") / f"{drive.name}-odometry"
     check_output(out / "ego_motion.csv", sequence / "ego_motion.csv")

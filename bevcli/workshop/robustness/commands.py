@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
-from bevcli.cli.progress import Progress, load_with_bar
+from bevcli.cli.progress import Progress, load_with_bar, open_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError
 from bevcli.inference import ModelOptions
@@ -49,7 +48,7 @@ def stress(
     loaded, why = load_with_bar(model, sequence or None)
     if drive_options.rendered is None:
         chosen = source.for_model(loaded.config)
-        drives = [bevcli.open_sequence(path, chosen, **format_options) for path in sequence or ()]
+        drives = [open_with_bar(path, chosen, format_options) for path in sequence or ()]
     else:
         drives = work.rendered_drives(drive_options, loaded.config, source)
     loaded = loaded.in_engine(drives[0].rig, drives[0])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import bevcli
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
+from bevcli.cli.progress import open_with_bar
 from bevcli.errors import InputError
 from bevcli.printing import print_note, say
 from bevcli.sequences.format import format_of, is_drive
@@ -96,7 +97,7 @@ def _print_agreement(
     """Print how well boxes agree with a detector in the images of a drive without ground truth."""
     from bevcli.workshop.trust.estimate import agreement_of_boxes, as_document
 
-    drive = bevcli.open_sequence(path, replace(source, ego_motion="optional"), **format_options)
+    drive = open_with_bar(path, replace(source, ego_motion="optional"), format_options)
     # Not what a run saw, which may be of another part of the drive.
     file = predictions / "predictions.json" if predictions.is_dir() else predictions
     found = agreement_of_boxes(file, drive, source.class_map, worst)
