@@ -77,7 +77,7 @@ class Network(TemporalModel):
             images = upright_images(images, image_from_upright, sizes, size)
             images = images.contiguous(memory_format=torch.channels_last)
         elif smaller < whole:
-            images = F.interpolate(images.flatten(0, 1), size, mode="bilinear", align_corners=False)
+            images = F.interpolate(images.flatten(0, 1), size, mode="bicubic", align_corners=False)
         else:
             images = images.flatten(0, 1)
         maps: list[Tensor] = self.backbone(images)

@@ -192,7 +192,7 @@ def upright_cameras(image_from_bev: Tensor, image_from_level: Tensor) -> tuple[T
 
 
 def upright_images(images: Tensor, image_from_upright: Tensor, sizes: Tensor, size: Sequence[int]) -> Tensor:
-    """(B·N, 3, h, w), turned and reduced. What no camera saw repeats the edge of its image.
+    """(B·N, 3, h, w), turned and reduced, cubic and so as sharp as they were. What no camera saw repeats the edge.
 
     Args:
         images: (B, N, 3, H, W), normalised and padded with zeros.
@@ -211,7 +211,8 @@ def upright_images(images: Tensor, image_from_upright: Tensor, sizes: Tensor, si
     edge = sizes.flatten(0, 1)[:, None]
     seen = torch.minimum((seen[..., :2] / seen[..., 2:]).clamp(min=0), edge - 1)
     places = (2 * seen + 1) / seen.new_tensor([width, height]) - 1
-    turned = F.grid_sample(images.flatten(0, 1), places.unflatten(1, x.shape), align_corners=False)
+    places, images = places.unflatten(1, x.shape), images.flatten(0, 1)
+    turned = F.grid_sample(images, places, mode="bicubic", padding_mode="border", align_corners=False)
     is_image = (pixels[..., :2] < edge[:, None] - 0.5).all(-1)  # (B·N, h, w)
     return turned * is_image[:, None]
 

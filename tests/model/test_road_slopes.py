@@ -128,7 +128,7 @@ def test_images_and_cameras_are_those_of_a_level_vehicle() -> None:
     expected = picture(upright_from_level)[0, 0]
     inside = slice(8, -8)
     assert (images[0, 0] - expected)[:, inside, inside].abs().max() > 0.1
-    torch.testing.assert_close(turned[:, inside, inside], expected[:, inside, inside], rtol=0, atol=2e-3)
+    torch.testing.assert_close(turned[:, inside, inside], expected[:, inside, inside], rtol=0, atol=3e-3)
 
 
 @pytest.mark.parametrize("size", [(HIGH, WIDE), (64, 107)])
@@ -137,7 +137,7 @@ def test_images_of_a_level_vehicle_are_only_reduced(size: tuple[int, int]) -> No
     images, sizes = torch.rand(1, 2, 3, HIGH, WIDE), torch.tensor([[[WIDE, HIGH], [WIDE, 80]]]).float()
     images[0, 1, :, 80:] = 0
     same = torch.eye(3).expand(1, 2, 3, 3)
-    expected = torch.nn.functional.interpolate(images[0], size, mode="bilinear", align_corners=False)
+    expected = torch.nn.functional.interpolate(images[0], size, mode="bicubic", align_corners=False)
     reduced = upright_images(images, same, sizes, size)
     rows = int(79 * size[0] / HIGH)
     torch.testing.assert_close(reduced[0], expected[0], rtol=0, atol=1e-4)
