@@ -153,6 +153,7 @@ def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None
         np.testing.assert_allclose(found.centers, frame.boxes.centers, atol=2e-3)
         np.testing.assert_allclose(found.yaws, frame.boxes.yaws, atol=2e-3)
         np.testing.assert_allclose(found.sizes_lwh, frame.boxes.sizes_lwh, atol=1e-3)
+    assert any("velocities of the boxes are not known" in note for note in labelled.notes)  # without tracks
 
 
 def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
@@ -180,7 +181,7 @@ def test_wrong_kitti_labels_are_one_clear_line(text: str, message: str, tmp_path
     with pytest.raises(InputError, match=message):
         WithLabels(MadeDrive(), tmp_path / "0000.txt")
     (tmp_path / "labels.xml").write_text("")
-    with pytest.raises(InputError, match=r"is no file of labels \(expected a CSV table .* or KITTI labels"):
+    with pytest.raises(InputError, match=r"is no file of labels \(expected KITTI labels .* or a table \(.csv\) with"):
         WithLabels(MadeDrive(), tmp_path / "labels.xml")
     with pytest.raises(InputError, match=r"`labels_camera=roof` .*: is not in the rig"):
         WithLabels(MadeDrive(), tmp_path / "0000.txt", LabelOptions(labels_camera="roof"))

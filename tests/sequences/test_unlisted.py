@@ -416,10 +416,25 @@ def test_a_mistake_in_a_drive_of_kitti_is_one_line(tmp_path):
     with pytest.raises(InputError, match=r"oxts: has 4 times and 3 files in data"):
         open_sequence(drive)
     (drive.parent / "calib_cam_to_cam.txt").unlink()
-    with pytest.raises(InputError, match=r"has no calibration \(expected calib.txt, or calib_cam_to_cam.txt"):
+    with pytest.raises(
+        InputError, match=r"has no calibration \(expected calib.txt, calib_cam_to_cam.txt .* or .*/perspective.txt"
+    ):
         open_sequence(drive)
     yaws = {"image_02": 0, "image_03": 0}
     assert open_sequence(drive, fov_deg=65, height=1.65, yaw_deg=yaws, ego_motion="static").rig
+
+
+def test_a_part_of_kitti_alone_says_what_to_give(tmp_path):
+    drive = images_of(tmp_path / "training/image_02/0000", ".")
+    (tmp_path / "training/calib").mkdir()
+    (tmp_path / "training/calib/0000.txt").write_text(rows(P2=K @ np.eye(3, 4)))
+    with pytest.raises(InputError, match=r"is of KITTI tracking, .*--calibration .*/training/calib/0000.txt"):
+        open_sequence(drive)
+    (tmp_path / "calib_cam_to_pose.txt").write_text(rows(image_00=np.eye(3, 4)))
+    with pytest.raises(InputError, match=r"has poses of cameras and no intrinsics: pass perspective.txt"):
+        open_sequence(kitti_raw(tmp_path), calibration=tmp_path / "calib_cam_to_pose.txt")
+    with pytest.raises(InputError, match=r"sequences: is no folder of poses \(expected data and timestamps.txt"):
+        open_sequence(kitti_odometry(tmp_path, "poses/07.txt"), ego_motion_file=tmp_path / "sequences")
 
 
 def test_kitti_360_as_it_lies_on_disk(tmp_path):

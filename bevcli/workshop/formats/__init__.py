@@ -139,7 +139,9 @@ class KittiDrive(FolderOptions, Format):
         if any((path / f"image_0{number}" / name).is_dir() for number in range(4) for name in ("data", "data_rect")):
             return True
         has_images = any((path / f"image_{number}").is_dir() for number in range(4))
-        return has_images and ((path / "calib.txt").exists() or (path / "times.txt").exists())
+        if has_images and ((path / "calib.txt").exists() or (path / "times.txt").exists()):
+            return True
+        return path.parent.name.startswith("image_0") and (path.parent.parent / f"calib/{path.name}.txt").exists()
 
 
 @options("Input")

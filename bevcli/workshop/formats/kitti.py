@@ -235,13 +235,20 @@ def open_kitti(path: Path, common: InputOptions, options: FolderOptions) -> Fold
     """A drive of KITTI as a `Drive`. Raises InputError."""
     drive = path.resolve()
     root = drive.parent.parent  # of KITTI-360
+    tracking = root / "calib" / f"{drive.name}.txt"
+    if drive.parent.name.startswith("image_0") and is_there(tracking):
+        raise InputError(
+            f"{path}: is of KITTI tracking, whose cameras have a folder each: copy its images into DRIVE/"
+            f"{drive.parent.name}/data, and pass DRIVE, `calibration` (`--calibration {tracking}`), `image_rate_hz=10` "
+            "(`--image-rate 10`) and `odometry=True` (`--odometry`)"
+        )
     files = [folder / name for folder in (path, drive.parent, root / "calibration") for name in KITTI_FILES]
     if options.calibration is None and options.intrinsics is None and options.fov_deg is None:
         calibration = next((file for file in files if is_there(file)), None)
         if calibration is None:
             raise InputError(
-                f"{path}: has no calibration (expected calib.txt, or calib_cam_to_cam.txt in the folder above): add "
-                "it, or pass `calibration` (`--calibration FILE`)"
+                f"{path}: has no calibration (expected calib.txt, calib_cam_to_cam.txt in the folder above, or "
+                f"{root.name}/calibration/perspective.txt): add it, or pass `calibration` (`--calibration FILE`)"
             )
         options = replace(options, calibration=calibration)
     if options.ego_motion_file is None:
@@ -289,6 +296,10 @@ def read_kitti(path: Path) -> Cameras | None:
             (rows[size][0], rows[size][-1]) if size in rows else None,
             {"model": "none"},
             pose,
+        )
+    if not cameras and file.name == CAMERAS_TO_POSE:
+        raise InputError(
+            f"{file}: has poses of cameras and no intrinsics: pass {KITTI_FILES[-1]}, with this file beside"
         )
     if not cameras:
         raise InputError(f"{file}: has no projection matrix (expected P2, or P_rect_02, of KITTI)")
@@ -343,6 +354,10 @@ def read_oxts(folder: Path) -> ReadPoses:
 
     The world has x east, y north and z up; its origin is the first place of the IMU. Raises InputError.
     """
+    if not (folder / "data").is_dir():
+        raise InputError(
+            f"{folder}: is no folder of poses (expected data and timestamps.txt of KITTI's oxts): pass a file"
+        )
     files = sorted((folder / "data").glob("*.txt"))
     times = read_times(folder / "timestamps.txt")
     if not files or len(times) != len(files):

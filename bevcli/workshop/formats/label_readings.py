@@ -171,7 +171,7 @@ def fitting(path: Path, frames: Sequence[PlacedBoxes], stated: Mapping[str, str]
     """
     left = [LabelReading({})]
     for names, sound, unit, ask in (
-        (("labels_sides",), SOUND_PERCENT, "% off usual sizes", _sides),
+        (("labels_sides",), SOUND_PERCENT, "% off usual shapes", _sides),
         (("labels_frame", "labels_z"), SOUND_M, "m", _places),
         (("labels_yaw", "labels_yaw_unit"), SOUND_DEG, "degrees", _yaws),
     ):

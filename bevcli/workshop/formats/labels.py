@@ -46,13 +46,13 @@ NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of
 
 def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     """The labels of a table in CSV, or in KITTI's format. rig: of the drive. Raises InputError."""
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() in (".csv", ".tsv"):
         labels = read_csv_labels(path)
     elif is_kitti(path):
         labels = read_kitti_labels(path, rig, options)
     else:
-        expected = "a CSV table (.csv) or KITTI labels (.txt, or a folder of these)"
-        raise InputError(f"{path}: is no file of labels (expected {expected})")
+        expected = "KITTI labels (.txt, or a folder of these), or a table (.csv) with frame or timestamp_ns, class, "
+        raise InputError(f"{path}: is no file of labels (expected {expected}{', '.join(NUMBERS)}): convert it to one")
     frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
@@ -179,8 +179,9 @@ def _with_velocities(sequence: Drive, boxes: dict[int, Boxes3D]) -> tuple[dict[i
     together = Boxes3D.concatenate(boxes.values())
     if not len(together) or np.isfinite(together.velocities).any():
         return boxes, ()
-    if together.instances is None or not sequence.has_ego_motion:
-        needed = "a column `instance`" if together.instances is None else "ego-motion"
+    has_tracks = together.instances is not None and bool((together.instances != "").any())
+    if not has_tracks or not sequence.has_ego_motion:
+        needed = "ego-motion" if has_tracks else "a column `instance`"
         return boxes, (f"the velocities of the boxes are not known ({needed} would give them): no box code is trained",)
     filled: dict[int, Boxes3D] = {}
     for _, scene in groupby(sorted(boxes), key=lambda index: sequence.stamps[index].scene):
