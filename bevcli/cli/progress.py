@@ -10,8 +10,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, TypeVar
 
-import typer
-
 from bevcli.inference import ModelOptions
 from bevcli.printing import duration, one_line, say
 
@@ -20,9 +18,7 @@ if TYPE_CHECKING:
 
     from bevcli.frame import Drive
     from bevcli.inference.load import Model
-    from bevcli.published import NamedWeights
     from bevcli.sequences.options import InputOptions
-    from bevcli.workshop.weights.fetch import FetchedWeights
 
 T = TypeVar("T")
 
@@ -30,8 +26,6 @@ LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
 OPENING_S = 8.0  # of a drive that is opened, until a line says so
-STOPPED = 130  # exit code of a download that Ctrl-C ends
-MB = 1_000_000
 Part = TypeVar("Part")
 
 
@@ -182,30 +176,6 @@ def last_of_steps(steps: Iterable[tuple[int, int] | T]) -> T:
     raise AssertionError("steps end with what they lead to")
 
 
-def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
-    """The file of weights, downloaded if it is not there.
-
-    The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
-    """
-    from bevcli.workshop.weights.fetch import download_weights, fetch_weights
-
-    bar: Progress | None = None
-    with ExitStack() as shown:
-        try:
-            for done, total in download_weights(weights, force=force):
-                if bar is None:
-                    note = f"{weights.name}: {weights.source.url}"
-                    bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [note]))
-                    bar.skip(done // MB)
-                bar.reach(done // MB)
-        except KeyboardInterrupt:
-            if bar is None:
-                raise
-            say("stopped; the same command goes on from here", err=True)
-            raise typer.Exit(STOPPED) from None
-    return fetch_weights(weights, force=force)
-
-
 def load_with_bar(options: ModelOptions, drives: Sequence[Path] | None = ()) -> tuple["Model", tuple[str, ...]]:
     """The model of the options, or one of the package for the drives, and a note on that choice (`choose_model`).
 
@@ -216,5 +186,7 @@ def load_with_bar(options: ModelOptions, drives: Sequence[Path] | None = ()) -> 
     options, notes = choose_model(options, drives)
     weights = weights_to_fetch(options)
     if weights is not None:
+        from bevcli.workshop.weights.commands import fetch_with_bar
+
         fetch_with_bar(weights)
     return load_model(options=options), notes

@@ -1,4 +1,4 @@
-"""Images of one camera as an AV1 stream, encoded and decoded by PyAV, an optional package."""
+"""Images of one camera as an AV1 stream, encoded by PyAV, an optional package."""
 
 import os
 from fractions import Fraction
@@ -44,20 +44,3 @@ class Av1Encoder:
     def close(self) -> None:
         """Ends the stream and frees the encoder."""
         self._context.encode(None)
-
-
-class Av1Decoder:
-    """Decodes the images that an `Av1Encoder` made, in order."""
-
-    def __init__(self) -> None:
-        self._context = av.CodecContext.create("libdav1d", "r")
-        self._context.options = {"max_frame_delay": "1", "threads": "1"}
-
-    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
-        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe and for damaged data."""
-        assert isinstance(self._context, av.VideoCodecContext)
-        try:
-            images = self._context.decode(av.Packet(data))
-        except av.FFmpegError:
-            return None
-        return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None

@@ -12,7 +12,6 @@ from fractions import Fraction
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -33,8 +32,8 @@ from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
 from bevcli.writing import whole_file
 
-if TYPE_CHECKING:
-    from bevcli.recording.av1 import Av1Decoder
+if has_av():
+    import av
 
 MOST_PIXELS = 64 << 20
 STRIPS = "LineStrips2D:strips"
@@ -46,6 +45,23 @@ BELOW_BOXES = (
 FOURCC = {".mp4": "vp09", ".webm": "VP90"}  # VP9: OpenCV's wheels cannot write H.264
 H264_QUALITY = 21  # x264's crf
 SLOWEST, FASTEST = 1.0, 30.0  # frames a second
+
+
+class Av1Decoder:
+    """Decodes the images that an `Av1Encoder` made, in order, by PyAV, an optional package."""
+
+    def __init__(self) -> None:
+        self._context = av.CodecContext.create("libdav1d", "r")
+        self._context.options = {"max_frame_delay": "1", "threads": "1"}
+
+    def decode(self, data: bytes) -> NDArray[np.uint8] | None:
+        """The next image, (H, W, 3) uint8 BGR; None before the first keyframe and for damaged data."""
+        assert isinstance(self._context, av.VideoCodecContext)
+        try:
+            images = self._context.decode(av.Packet(data))
+        except av.FFmpegError:
+            return None
+        return images[-1].to_ndarray(format="bgr24").astype(np.uint8, copy=False) if images else None
 
 
 class RecordedImages:
@@ -61,8 +77,6 @@ class RecordedImages:
         if data:
             if camera not in self._decoders:
                 require_av("the images of this recording are AV1")
-                from bevcli.recording.av1 import Av1Decoder
-
                 self._decoders[camera] = Av1Decoder()
             return self._decoders[camera].decode(data)
         encoded = frame.blob(entity, "EncodedImage:blob")
@@ -363,8 +377,6 @@ def _vp9(video: str, rate: float, size: tuple[int, int]) -> Iterator[Callable[[n
 
 @contextmanager
 def _h264(video: str, rate: float, size: tuple[int, int]) -> Iterator[Callable[[np.ndarray], object]]:
-    import av
-
     with av.open(video, "w", options={"movflags": "+faststart"}) as container:
         exact = Fraction(rate).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=exact, options={"crf": str(H264_QUALITY)})

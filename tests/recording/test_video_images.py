@@ -10,10 +10,10 @@ from bevcli import recording as options
 from bevcli.errors import BevcliError
 from bevcli.recording import RecordingOptions, entities
 from bevcli.viewer.recording_reader import RecordingReader
-from bevcli.workshop.video import RecordedImages
+from bevcli.workshop.video import Av1Decoder, RecordedImages
 
 if options.has_av():
-    from bevcli.recording.av1 import KEYFRAME_EVERY, Av1Decoder, Av1Encoder
+    from bevcli.recording.av1 import KEYFRAME_EVERY, Av1Encoder
 
 with_av = pytest.mark.skipif(not options.has_av(), reason="PyAV is not installed: pip install 'bevcli[video]'")
 

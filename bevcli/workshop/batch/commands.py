@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bevcli.cli.bridge import FormatValues, Json, Part, argument
-from bevcli.cli.progress import Progress, fetch_with_bar, load_with_bar
+from bevcli.cli.progress import Progress, load_with_bar
 from bevcli.cli.stop_signals import StopSignals
 from bevcli.errors import InputError, WeightsError
 from bevcli.inference import ModelOptions
@@ -21,6 +21,7 @@ from bevcli.runs import RunOptions
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.batch import BatchOptions, ReproduceOptions, Workers
 from bevcli.workshop.formats import NuScenesOptions
+from bevcli.workshop.weights.commands import fetch_with_bar
 
 if TYPE_CHECKING:
     from bevcli.published import NamedWeights

@@ -1,6 +1,7 @@
 """`bevcli weights`: lists and downloads published weights, inspects and converts files, lists the parts of a model."""
 
 import json
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +10,7 @@ import typer
 
 from bevcli.cli.bridge import Json, Part, argument, command, model_option
 from bevcli.cli.main import PlainCommand
-from bevcli.cli.progress import fetch_with_bar
+from bevcli.cli.progress import Progress
 from bevcli.errors import OutputError
 from bevcli.inference import ModelOptions
 from bevcli.options import Option
@@ -20,7 +21,10 @@ from bevcli.workshop.weights import ModelFileOptions, PackOptions
 if TYPE_CHECKING:
     from bevcli.checkpoints import Checkpoint
     from bevcli.published import NamedWeights
+    from bevcli.workshop.weights.fetch import FetchedWeights
 
+STOPPED = 130  # exit code of a download that Ctrl-C ends
+MB = 1_000_000
 PANEL = "Train"
 weights_app = typer.Typer(
     help="List, download, inspect and convert weights.",
@@ -232,3 +236,27 @@ def _as_text(checkpoint: "Checkpoint") -> str:
         *(f"  {name:<15} {value}" for name, value in rows if value),
     ]
     return "\n".join(lines)
+
+
+def fetch_with_bar(weights: "NamedWeights", *, force: bool = False) -> "FetchedWeights":
+    """The file of weights, downloaded if it is not there.
+
+    The bar starts when the size is known. Ctrl-C ends the command; what has come is kept.
+    """
+    from bevcli.workshop.weights.fetch import download_weights, fetch_weights
+
+    bar: Progress | None = None
+    with ExitStack() as shown:
+        try:
+            for done, total in download_weights(weights, force=force):
+                if bar is None:
+                    note = f"{weights.name}: {weights.source.url}"
+                    bar = shown.enter_context(Progress(max(total or 0, done + MB) // MB, "MB", [note]))
+                    bar.skip(done // MB)
+                bar.reach(done // MB)
+        except KeyboardInterrupt:
+            if bar is None:
+                raise
+            say("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(STOPPED) from None
+    return fetch_weights(weights, force=force)
