@@ -39,24 +39,16 @@ UNFIT = 2.5  # times these: the usual one is refused
 CLEAR, CLEAR_SOUND = 2.0, 0.3  # factor, and addition as a share of these, by which all other residuals are larger
 FEWEST = 5  # boxes that tell the road and the yaws
 SAME, COMPARED = np.array([0.02] * 6 + [np.radians(1)]), 200  # metres and radians; boxes that are compared
-OVERLAPS, SOUND_OVERLAP = (
-    0.2,
-    0.35,
-)  # of a box and an object in an image: they belong together; mean of a reading that fits
-CLEARLY, CLEARLY_USUAL = (
-    3.0,
-    1.5,
-)  # standard errors by which another reading is worse than the best, and than the usual one
-SPREAD = 0.2  # of overlaps, where one object was seen
+# Overlaps of a box and an object in an image: they belong together; mean of a reading that fits; spread of one object.
+OVERLAPS, SOUND_OVERLAP, SPREAD = 0.2, 0.35, 0.2
+CLEARLY, CLEARLY_USUAL = 3.0, 1.0  # standard errors by which a reading is worse than the best, and than the usual one
 LARGEST_RADIANS, LARGEST_DEGREES = 6.5, 361.0  # a little more than a turn
 LONGEST_M, USUAL_M = 300.0, 30.0  # of the longest box, and of the median one; a train has 200 m
 IN_CENTIMETRES = 1000.0  # a smaller median is that of boxes in centimetres
 LONG_M = 1.7  # of classes that drive ahead
 NEAR_M, FAR_M = 40.0, 300.0  # of boxes that tell the road; of boxes that are not around the vehicle
 TURNED_RAD, BY_CHANCE = 0.5, 4.6  # yaws that are not near 0; Rayleigh's statistic that chance exceeds once in a hundred
-ASIDE = (
-    "neither boxes nor images tell the bev frame from others on the vehicle: pass `--labels-frame bev` if it is that"
-)
+ASIDE = "neither boxes nor images tell the bev frame from others on the vehicle: pass `--labels-frame bev` if it is"
 WAY_M, DRIVEN_M = 1.0, (0.5, 8.0)  # between two frames: of the vehicle, of driving objects
 STANDING_SHARE = 30  # percentage of the boxes that stand
 ALLOWED_M = 0.5  # by which standing boxes move, and by which boxes leave the plane of the road
