@@ -39,9 +39,6 @@ UNFIT = 2.5  # times these: the usual one is refused
 CLEAR, CLEAR_SOUND = 2.0, 0.3  # factor, and addition as a share of these, by which all other residuals are larger
 FEWEST = 5  # boxes that tell the road and the yaws
 SAME, COMPARED = np.array([0.02] * 6 + [np.radians(1)]), 200  # metres and radians; boxes that are compared
-# Overlaps of a box and an object in an image: they belong together; mean of a reading that fits; spread of one object.
-OVERLAPS, SOUND_OVERLAP, SPREAD = 0.2, 0.35, 0.2
-CLEARLY, CLEARLY_USUAL = 3.0, 1.0  # standard errors by which a reading is worse than the best, and than the usual one
 LARGEST_RADIANS, LARGEST_DEGREES = 6.5, 361.0  # a little more than a turn
 LONGEST_M, USUAL_M = 300.0, 30.0  # of the longest box, and of the median one; a train has 200 m
 IN_CENTIMETRES = 1000.0  # a smaller median is that of boxes in centimetres
@@ -183,7 +180,7 @@ def _left(
         each for each in readings if all(stated.get(name, value) == value for name, value in each.states.items())
     ]
     usual, best, fitting = possible[0], *(min(some, key=lambda each: each.residual) for some in (possible, readings))
-    if not np.isfinite(best.residual) and (best is usual or not np.isfinite(fitting.residual)):
+    if not np.isfinite(fitting.residual):  # the boxes do not tell
         return possible
     left = [each for each in possible if each.residual <= CLEAR * best.residual + CLEAR_SOUND * sound]
     by = f"{usual.residual:.1f} {unit}" if np.isfinite(usual.residual) else "far away"
@@ -202,11 +199,9 @@ def _left(
         doubt = f"{why}: correct the file, or pass `{usual.flags(names)}` to read it so"
         return [replace(each, doubt=each.doubt or doubt) for each in possible]
     differ = [name for name in differing([usual, *left]) if name in names]
-    return [replace(each, notes=(*each.notes, _shown(each, usual, differ, unit, by))) for each in left]
-
-
-def _shown(reading: LabelReading, usual: LabelReading, names: Sequence[str], unit: str, by: str) -> str:
-    return f"{reading.words(names)} (the boxes: {reading.residual:.1f} {unit}; {usual.words(names)}: {by})"
+    off = f"{usual.words(differ)}: {by}"
+    notes = [f"{each.words(differ)} (the boxes: {each.residual:.1f} {unit}; {off})" for each in left]
+    return [replace(each, notes=(*each.notes, note)) for each, note in zip(left, notes, strict=True)]
 
 
 def _unlike(frames: Sequence[PlacedBoxes], readings: Sequence[LabelReading]) -> list[LabelReading]:
@@ -221,41 +216,6 @@ def _unlike(frames: Sequence[PlacedBoxes], readings: Sequence[LabelReading]) -> 
         if not (off <= SAME).all(axis=(1, 2)).any():
             kept, places = [*kept, reading], np.concatenate([places, place[None]])
     return kept or list(readings)
-
-
-def shown_by_images(readings: Sequence[LabelReading], overlaps: Array, count: int) -> list[LabelReading]:
-    """The readings that fit the images, in their order; all where the images do not tell.
-
-    Args:
-        readings: the usual one first.
-        overlaps: (R, D) of the boxes of each reading with D objects in the images, 0 to 1.
-        count: of the boxes in the frames of these images.
-    """
-    best = int(overlaps.sum(axis=1).argmax())
-    if overlaps[best].sum() < max(SOUND_OVERLAP * min(overlaps.shape[1], count / 2), SOUND_OVERLAP):
-        return list(readings)
-    kept = [index for index, of in enumerate(overlaps) if _clearness(overlaps[best], of) < CLEARLY]
-    if 0 in kept:
-        kept = [index for index in kept if not index or _clearness(overlaps[0], overlaps[index]) < CLEARLY_USUAL]
-    fits, others = overlaps.mean(axis=1), [index for index in range(len(readings)) if index not in kept]
-    if not others:
-        return [replace(reading, doubt="") for reading in readings]
-    other = readings[max(others, key=lambda index: float(fits[index]))]
-    fit, found = float(max(fits[others])), []
-    for reading, own in zip([readings[index] for index in kept], fits[kept], strict=True):
-        names = differing([reading, other])
-        told = [name for name, value in reading.states.items() if name in names or value != USUAL[name]]
-        note = f"{reading.words(told)} (the images: overlap {own:.2f}; {other.words(names)}: {fit:.2f})"
-        found.append(replace(reading, notes=(*reading.notes, note), doubt=""))
-    return found
-
-
-def _clearness(one: Array, other: Array) -> float:
-    """Mean difference of overlaps with objects, in standard errors."""
-    differences = (one - other)[np.maximum(one, other) > OVERLAPS]
-    count, mean = len(differences), float(differences.sum()) / max(len(differences), 1)
-    spread = np.sqrt((np.square(differences - mean).sum() + SPREAD**2) / max(count, 1))
-    return mean / float(spread) * np.sqrt(count)
 
 
 def decided(

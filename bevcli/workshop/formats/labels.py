@@ -31,16 +31,13 @@ from bevcli.workshop.formats.kitti import is_kitti, read_kitti_labels
 from bevcli.workshop.formats.label_readings import (
     USUAL,
     LabelledFrame,
-    LabelReading,
     Labels,
     PlacedBoxes,
     check_labels,
     decided,
     fitting,
-    shown_by_images,
 )
 
-MOST_FRAMES, MOST_PROJECTED = 4, 15_000  # frames whose images are looked at; boxes of all readings in them
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 
 
@@ -151,27 +148,11 @@ def _in_world(
     frames = [placed[index] for index in sorted(placed)]
     left = fitting(path, frames, stated)
     if len(left) > 1 or left[0].doubt:
-        left = _shown_by_images(sequence, placed, left)
+        from bevcli.workshop.trust.witness import shown_by_images
+
+        left = shown_by_images(sequence, placed, left)
     states, notes = decided(path, frames, left, stated)
     return {index: each.read_as(states) for index, each in placed.items()}, notes
-
-
-def _shown_by_images(
-    sequence: Drive, placed: Mapping[int, PlacedBoxes], readings: Sequence[LabelReading]
-) -> list[LabelReading]:
-    """The readings that fit the images of some frames, by a detector of objects in images."""
-    from bevcli.workshop.trust.witness import overlaps_seen
-
-    indices = [index for index in sorted(placed) if len(placed[index].boxes)]
-    many = len(readings) * sum(len(placed[index].boxes) for index in indices)
-    count = min(MOST_FRAMES, len(indices), max(1, MOST_PROJECTED * len(indices) // max(many, 1)))
-    looked_at = [indices[place] for place in np.linspace(0, len(indices) - 1, count).astype(int)]
-    overlaps = [np.zeros((len(readings), 0))]
-    for index in looked_at:
-        boxes = [placed[index].read_as(each.states) for each in readings]
-        overlaps.append(overlaps_seen(sequence.load(index), boxes))
-    boxes_count = sum(len(placed[index].boxes) for index in looked_at)
-    return shown_by_images(readings, np.concatenate(overlaps, axis=1), boxes_count)
 
 
 def _with_velocities(sequence: Drive, boxes: dict[int, Boxes3D]) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
