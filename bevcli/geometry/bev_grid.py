@@ -64,9 +64,9 @@ class BevGrid:
         """Row and column (..., 2) int64 of points (..., 2) in metres; -1, -1 for a point outside the grid."""
         p = np.asarray(points_xy, dtype=np.float64)
         low = np.array([self.x_range_m[0], self.y_range_m[0]])
-        cell = np.floor((p - low) / np.array(self.cell_size_m)).astype(np.int64)[..., ::-1]
+        cell = np.floor((p - low) / np.array(self.cell_size_m))[..., ::-1]
         inside = ((cell >= 0) & (cell < np.array([self.rows, self.columns]))).all(-1)
-        return np.where(inside[..., None], cell, -1)
+        return np.where(inside[..., None], cell, -1).astype(np.int64)  # here, as infinity is no integer
 
 
 def rectangle(x_range_m: tuple[float, float], y_range_m: tuple[float, float]) -> Array:

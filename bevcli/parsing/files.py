@@ -19,7 +19,7 @@ from bevcli.errors import BevcliError, InputError, WeightsError
 from bevcli.printing import valid_text
 
 MIB = 1 << 20
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v")
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".webm", ".mov", ".m4v", ".ts", ".mts", ".m2ts")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 # RLIMIT_DATA, and not the address space: allocators reserve more than they use.
 LIMIT_MEMORY = """

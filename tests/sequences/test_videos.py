@@ -135,6 +135,7 @@ WRITTEN = {
     "plain.mp4": ("mpeg4", {}, {}), "fragments.mp4": ("mpeg4", {}, {"movflags": "frag_keyframe+empty_moov"}),
     "reordered.mov": ("libx264", {"bf": "2", "g": "9"}, {}), "v.mkv": ("ffv1", {}, {}), "v.webm": ("libvpx", {}, {}),
     "live.mkv": ("mpeg4", {}, {"live": "1"}),
+    "dash.ts": ("libx264", {"bf": "0"}, {}),
 }  # fmt: skip
 
 

@@ -149,7 +149,7 @@ class VideoFile(FolderOptions, Format):
     """A drive that is a video of one camera."""
 
     name = "a video"
-    expected = ".mp4, .mkv, .avi, .webm, .mov or .m4v"
+    expected = ".mp4, .mkv, .avi, .webm, .mov, .m4v, .ts, .mts or .m2ts"
     reader = "bevcli.workshop.formats.video_file:open_video"
     has_poses = False
 
