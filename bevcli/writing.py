@@ -59,12 +59,13 @@ def whole_file(path: Path, *, parents: bool = False, regular: bool = False) -> I
     stays as it was. Several processes may write the file at the same time: the last one wins. What killed processes
     left is deleted. A device or a pipe, and what is in /dev, is written directly.
 
-    parents: make the folders that are missing. regular: the file takes the place of a pipe too: a pipe that somebody
-    has put there would be waited for.
+    parents: make the folders that are missing; after an error they are deleted. regular: the file takes the place of a
+    pipe too: a pipe that somebody has put there would be waited for.
     Raises OutputError where the file cannot be written; every OSError of the block counts as this. Errors of the block
     name `path`.
     """
     machine = f"{UNFINISHED}{zlib.crc32(platform.node().encode()):08x}-"
+    made = [folder for folder in path.parents if parents and not folder.exists()]
     unfinished = path.with_name(f"{machine}{os.getpid()}-{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         with output_errors(path):
@@ -86,6 +87,9 @@ def whole_file(path: Path, *, parents: bool = False, regular: bool = False) -> I
         for left in (unfinished, partial_path(unfinished)):
             with suppress(OSError):
                 left.unlink()
+        for folder in made:
+            with suppress(OSError):  # it holds the file, or another one
+                folder.rmdir()
 
 
 def write_whole(path: Path, content: bytes, **how: bool) -> None:

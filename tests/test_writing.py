@@ -27,8 +27,8 @@ def test_a_written_file_has_its_name_and_leaves_nothing_else(tmp_path):
 
 @pytest.mark.parametrize(("failure", "raised"), [(OSError(28, "disk full"), OutputError), (ValueError(), ValueError)])
 def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
-    def fail(path):
-        with whole_file(path) as unfinished:
+    def fail(path, **how):
+        with whole_file(path, **how) as unfinished:
             unfinished.write_text("half")
             raise failure
 
@@ -37,6 +37,8 @@ def test_after_an_error_the_old_file_is_there(tmp_path, failure, raised):
     with pytest.raises(raised):
         fail(path)
     assert path.read_text() == "old"
+    with pytest.raises(raised):
+        fail(tmp_path / "new" / "folder" / "file.txt", parents=True)
     assert list(tmp_path.iterdir()) == [path]
 
 

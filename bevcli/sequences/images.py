@@ -30,7 +30,7 @@ CONTAINERS = (
     (4, b"ftyp"), (4, b"moov"), (4, b"mdat"), (4, b"wide"), (4, b"free"), (4, b"skip"), (0, b"RIFF"),
     (0, b"\x1a\x45\xdf\xa3"), (0, b"\x00\x00\x00\x01"), (0, b"\x00\x00\x01"),
 )  # fmt: skip
-TS_PACKET = 188  # bytes of an MPEG transport stream, each of which begins with G
+TS_PACKET = 188  # bytes of an MPEG transport stream; each begins with G, in .m2ts after a time
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
 SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 
@@ -81,7 +81,7 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     with open_regular(path, missing="is missing") as file:
         start = file.read(2 * TS_PACKET)
     # FFmpeg recognises playlists too, which could lead it to other files and to servers.
-    is_transport = any(start[offset::TS_PACKET][:2] == b"GG" for offset in (0, 4))  # .m2ts has a time before each packet
+    is_transport = any(start[offset::TS_PACKET][:2] == b"GG" for offset in (0, 4))
     if not is_transport and not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM, AVI or MPEG-TS)")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing: what fails here is told in one line

@@ -291,8 +291,9 @@ def pack_model(
         json.dumps(msgspec.to_builtins(packed), indent=1, ensure_ascii=False) + "\n",
         model_card(config, card_facts, checkpoint.parameters),
     ]
-    for target, content in zip(targets, (texts[0].encode(), weights, texts[1].encode()), strict=True):
-        write_whole(target, content, parents=True)
+    write_whole(out / WEIGHTS, weights, parents=True)  # first: if the disk is full, nothing is left
+    for target, text in zip((out / CONFIG, out / CARD), texts, strict=True):
+        write_whole(target, text.encode())
     notes = list(card_facts.missing)
     if any(settings.mesh for settings in config.class_settings.values()):
         notes.append("meshes of classes are files of this machine: the folder has none")
