@@ -11,6 +11,7 @@ import json
 import os
 import re
 import shutil
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -410,7 +411,7 @@ def open_index(tables: Path, dialect: Dialect = NUSCENES) -> tuple[NuScenesIndex
     states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in sorted(tables.glob("*.json"))]
     fingerprint = json.dumps({"format": CACHE_FORMAT, "tables": states})
     with suppress(OSError, ValueError, EOFError):  # there is no cache, or it is damaged
-        if (folder / FINGERPRINT).read_text(encoding="utf-8") == fingerprint:
+        if (folder / FINGERPRINT).read_text(encoding="utf-8") == f"{fingerprint}\n{_checksum(folder)}":
             return _load(folder), ""
     index = build_index(tables, dialect)
     try:
@@ -429,11 +430,19 @@ def _save(index: NuScenesIndex, folder: Path, fingerprint: str) -> None:
         for group, table in vars(index).items():
             for name, values in vars(table).items():
                 np.save(unfinished / f"{group}.{name}.npy", values, allow_pickle=False)
-        (unfinished / FINGERPRINT).write_text(fingerprint, encoding="utf-8")
+        (unfinished / FINGERPRINT).write_text(f"{fingerprint}\n{_checksum(unfinished)}", encoding="utf-8")
         remove_parts(folder.parent, [folder.name])
         unfinished.rename(folder)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)  # of a full disk, or where another process was faster
+
+
+def _checksum(folder: Path) -> int:
+    """Of all arrays: a crash or a bad disk may leave other contents of the same size."""
+    total = 0
+    for path in sorted(folder.glob("*.npy")):
+        total = zlib.crc32(np.memmap(path, np.uint8, "r").data, total)
+    return total
 
 
 def _load(folder: Path) -> NuScenesIndex:
