@@ -27,7 +27,6 @@ import bevcli
 from bevcli.cli.main import app
 from bevcli.config import load_config
 from bevcli.model.bevformer import BEVFormer
-from bevcli.workshop.bevformer_v2 import BEVFormerV2, BEVFormerV2Config
 from bevcli.workshop.training.job import TrainingConfig
 
 ROOT = Path(__file__).parents[1]
@@ -263,48 +262,17 @@ PAGE = ROOT / "docs/bevformer.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 CAMERAS = 6
 MODELS = ("tiny", "base")
-V2_MODELS = ("v2-t1", "v2-t2", "v2-t8")
 
 
-def table_rows(models: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    """Name of a tensor or part -> model -> what the page states, in the tables of these models."""
+def table_rows() -> dict[str, dict[str, str]]:
+    """Name of a tensor or part -> model -> what the page states, in the tables of MODELS."""
     rows = {}
     for line in TEXT.splitlines():
         cells = [cell.strip().strip("`") for cell in line.strip("|").split("|")]
-        titles = ("tensor", "part", "tensor of V2", "---")
-        if line.startswith("|") and len(cells) == 1 + len(models) and cells[0] not in titles:
+        if line.startswith("|") and len(cells) == 1 + len(MODELS) and cells[0] not in ("tensor", "part", "---"):
             assert cells[0] not in rows, f"{cells[0]} stands in two tables"
-            rows[cells[0]] = dict(zip(models, cells[1:], strict=True))
+            rows[cells[0]] = dict(zip(MODELS, cells[1:], strict=True))
     return rows
-
-
-def facts_of_v2(name: str) -> dict[str, str]:
-    """What the page should state of a BEVFormerV2."""
-    config = load_config(name)
-    assert isinstance(config, BEVFormerV2Config)
-    width, height = config.image.padded_size
-    count, cells = len(config.frames), config.bev_grid.rows * config.bev_grid.columns
-    with torch.device("meta"), torch.inference_mode():
-        model = BEVFormerV2(config).eval()
-        images = torch.zeros(1, CAMERAS, 3, height, width)
-        tokens = model.image_features(images, torch.arange(CAMERAS)).tokens
-        maps = torch.zeros(count, cells, config.channels)
-        fused = None if model.fusion is None else model.fusion(list(maps[:, None]))[0]
-    remembered = config.past_frames
-    return {
-        "cropped images": str(tuple(images[0].shape)),
-        "tokens of a frame": str(tuple(tokens.shape)),
-        "maps of the window": str(tuple(maps.shape)),
-        "input of the fusion": "–"
-        if model.fusion is None
-        else f"({count * config.channels}, {config.bev_grid.rows}, {config.bev_grid.columns})",
-        "output of the fusion": "–" if fused is None else str(tuple(fused.shape)),
-        "parameters of the fusion": "–"
-        if model.fusion is None
-        else f"{sum(parameter.numel() for parameter in model.fusion.parameters()):,}",
-        "remembered frames": str(remembered),
-        "memory of the window, float32": f"{remembered * tokens.numel() * 4 / 1e6:.0f} MB",
-    }
 
 
 def facts_of(name: str) -> dict[str, str]:
@@ -373,13 +341,7 @@ def facts_of(name: str) -> dict[str, str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_the_tables_state_the_shapes_and_sizes_of_the_models(model):
-    assert {label: stated[model] for label, stated in table_rows(MODELS).items()} == facts_of(model)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", V2_MODELS)
-def test_the_table_of_v2_states_shapes_and_sizes_of_its_models(model):
-    assert {label: stated[model] for label, stated in table_rows(V2_MODELS).items()} == facts_of_v2(model)
+    assert {label: stated[model] for label, stated in table_rows().items()} == facts_of(model)
 
 
 def test_named_classes_and_functions_are_in_the_linked_files():

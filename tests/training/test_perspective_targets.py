@@ -472,22 +472,6 @@ def test_a_batch_has_its_frames_mean_loss_by_positive_pixel() -> None:
     assert sum(whole.values()).item() == pytest.approx(total / count, rel=1e-4)
 
 
-def test_each_weight_scales_its_part() -> None:
-    data, head, maps = batch(), make_head(), random_maps(4)
-    full = loss_of(head, maps, data, replace(WEIGHTS, weight=3.0))
-    once = loss_of(head, maps, data)
-    torch.testing.assert_close(full["perspective classes"], 3 * once["perspective classes"])
-    torch.testing.assert_close(full["perspective boxes"], 3 * once["perspective boxes"])
-    names = ("offset_weight", "depth_weight", "size_weight", "rotation_weight")
-    no_boxes = dict.fromkeys(names, 0.0)
-    parts = [
-        loss_of(head, maps, data, replace(WEIGHTS, **no_boxes | {n: getattr(WEIGHTS, n)}))["perspective boxes"]
-        for n in names
-    ]
-    assert all(part > 0 for part in parts)
-    torch.testing.assert_close(sum(parts), once["perspective boxes"])
-
-
 def test_boxes_outside_the_grid_are_detected_too() -> None:
     """The grid ends at 16 m; the camera sees further."""
     config = replace(TWO_LEVELS, bev_grid=replace(TWO_LEVELS.bev_grid, y_range_m=(-6, 6)))
