@@ -153,12 +153,15 @@ class MatchedPoints:
         )
 
     def residual_px(self, ego_from_camera: Array, ego_b_from_ego_a: Array) -> float:
-        """The mean of the pairs' median residuals, reduced pixels. Arguments: (P, 4, 4), of each pair."""
+        """The mean of the pairs' median residuals, reduced pixels, each by its number of points: a few may be on a car.
+
+        Arguments: (P, 4, 4), of each pair.
+        """
         geometry, medians = GroupGeometry(ego_from_camera, ego_from_camera, ego_b_from_ego_a, np.zeros(2)), []
         off = _off_px(self._points, geometry)
         for start, end in zip(self._bounds, self._bounds[1:], strict=False):
             medians.append(min(float(np.median(off[start:end])), MOST_PX))
-        return float(np.mean(medians))
+        return float(np.average(medians, weights=np.diff(self._bounds)))
 
     def motions_seen(self, ego_from_camera: Array) -> Array:
         """(P, 4, 4) ego_b_from_ego_a by the images alone: a vehicle that drives along an arc."""
