@@ -182,10 +182,10 @@ class RigOptions:
         "d down. Default: what the images show.",
         metavar="XYZ",
     )
-    camera_axes: Literal["optical", "vehicle", "opengl", "unity", "unreal"] | None = option(
+    camera_axes: Literal["optical", "vehicle", "opengl", "unity", "unreal", "ned"] | None = option(
         default=None,
         help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
-        "up, z backward (opengl); the same, z forward (unity); x forward, y right, z up (unreal).",
+        "up, z backward (opengl) or forward (unity); x forward, y right, z up (unreal) or down (ned).",
     )
     rig_angles: RigAngles | None = option(
         default=None,

@@ -124,6 +124,27 @@ SPELLINGS = {
 }
 
 
+def turned(name):
+    return Rotation.from_matrix(pose(name)[:3, :3])
+
+
+SPELLINGS |= {
+    "sensor2ego_rotation": lambda name: entry(name, sensor2ego_rotation=turned(name).as_quat().tolist(),
+                                              sensor2ego_translation=pose(name)[:3, 3].tolist()),
+    "ypr": lambda name: entry(name, position=pose(name)[:3, 3].tolist(),
+                              ypr_deg=turned(name).as_euler("ZYX", degrees=True).tolist()),
+    "a projection": lambda name: {"D": D, "lidar2img": (k_of(name) @ np.linalg.inv(pose(name))[:3]).tolist()},
+    "MATLAB": lambda name: {"IntrinsicMatrix": k_of(name).T.tolist(), "ImageSize": [450, 800], "D": D,
+                            "T_ego_cam": pose(name).tolist()},
+    "RealSense": lambda name: {**dict(zip(("fx", "fy", "ppx", "ppy"), four(name), strict=True)), "D": D,
+                               "matrix_world": pose(name).tolist()},
+    "axes of Audi's cameras": lambda name: {
+        "CamMatrix": k_of(name).tolist(), "Resolution": [800, 450], "Distortion": [D],
+        "view": {"origin": pose(name)[:3, 3].tolist(), "x-axis": pose(name)[:3, 2].tolist(),
+                 "y-axis": (-pose(name)[:3, 0]).tolist()}},
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("layout", "spelling"),
     [
@@ -146,7 +167,7 @@ def test_k_d_and_t_under_their_usual_names(tmp_path, spelling, layout):
     assert_is_the_street(found.rig, lens=True)
     assert found.rig[NAMES[0]].distortion.coefficients == tuple(D)
     [line] = found.notes
-    inverted = spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec")
+    inverted = spelling in ("T_cam_ego", "extrinsics, either way", "rvec and tvec", "a projection")
     direction = "camera_from_ego" if inverted else "ego_from_camera"
     assert re.search(f"{direction}, .*camera axes {'x forward' if 'axes' in spelling else 'x right'}", line)
 

@@ -187,6 +187,61 @@ def test_joints_of_a_urdf(tmp_path):
     assert_is_the_street(read(intrinsics, None, extrinsics=path).rig)
 
 
+def stamped(frame, parent, matrix):
+    """geometry_msgs/TransformStamped."""
+    turn = dict(zip("xyzw", Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist(), strict=True))
+    placed = {"rotation": turn, "translation": dict(zip("xyz", matrix[:3, 3].tolist(), strict=True))}
+    return {"header": {"frame_id": parent}, "child_frame_id": frame, "transform": placed}
+
+
+@pytest.mark.parametrize("program", ["tf_static", "Apollo"])
+def test_frames_as_messages_of_ros(tmp_path, program):
+    """All in one dump; or one a file, as Apollo has them, the cameras on the lidar and this on the receiver."""
+    ending = "_optical_frame" if program == "tf_static" else ""
+    frames = [stamped(name + ending, "lidar" if program == "Apollo" else "base_link", pose(name)) for name in NAMES]
+    frames.append(stamped("lidar", "novatel", np.eye(4)))
+    for name in NAMES:
+        intrinsics = {"K": k_of(name).ravel().tolist(), "width": SIZE[0], "height": SIZE[1]}
+        folder = written(tmp_path, intrinsics, f"intrinsics/{name}_intrinsics.yaml").parent
+    for each in frames if program == "Apollo" else ():
+        extrinsics = written(tmp_path, each, f"extrinsics/{each['child_frame_id']}_extrinsics.yaml").parent
+    if program == "tf_static":
+        extrinsics = written(tmp_path, {"transforms": frames}, "tf/tf.yaml")
+    assert_is_the_street(read(folder, None, extrinsics=extrinsics).rig)
+
+
+def of_basalt(names):
+    turns = [Rotation.from_matrix(pose(name)[:3, :3]).as_quat().tolist() for name in names]
+    lists = {
+        "T_imu_cam": [dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), (*pose(name)[:3, 3].tolist(), *turn),
+                               strict=True)) for name, turn in zip(names, turns, strict=True)],
+        "intrinsics": [{"camera_type": "pinhole", "intrinsics": dict(
+            zip(("fx", "fy", "cx", "cy"), four(name), strict=True))} for name in names],
+        "resolution": [list(SIZE)] * len(names),
+    }  # fmt: skip
+    return {"value0": lists}
+
+
+def of_argoverse(names):
+    keys = [f"focal_{kind}_{axis}_px_" for kind in ("length", "center") for axis in "xy"]
+    return {"camera_data_": [{"key": name, "value": {
+        **dict(zip(keys, four(name), strict=True)),
+        "vehicle_SE3_camera_": {"rotation": {"coefficients": wxyz(pose(name))},
+                                "translation": pose(name)[:3, 3].tolist()},
+    }} for name in names]}  # fmt: skip
+
+
+def of_once(names):
+    inside = {name: {"cam_to_velo": pose(name).tolist(), "cam_intrinsic": k_of(name).tolist()} for name in names}
+    return {"meta": {"weather": "sunny"}, "calib": inside}
+
+
+@pytest.mark.parametrize("written_by", [of_basalt, of_argoverse, of_once])
+def test_lists_and_inner_mappings_of_cameras(tmp_path, written_by):
+    names = [f"cam{index}" for index in range(len(NAMES))] if written_by is of_basalt else NAMES
+    assert_is_the_street(read(written(tmp_path, written_by(sorted(NAMES)), "calibration.json")).rig, names)
+
+
 @pytest.mark.parametrize("program", ["COLMAP", "nerfstudio"])
 @pytest.mark.parametrize("layout", ["one image of each camera", "a folder of each camera"])
 def test_a_camera_an_image(tmp_path, program, layout):

@@ -98,6 +98,22 @@ FORMATS = {
               header="date,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"), "matrices, 60 rows"),
     "angles in Greek": (
         lines(S, X, Y, *LEVEL, YAW, separator=",", header="t,x,y,phi,theta,psi"), "yaw in radians"),
+    "rostopic echo -p": (
+        lines(range(COUNT), NS, X, Y, ZERO, *LEVEL, QZ, QW, separator=",", header="%time,field.header.stamp,"
+              + ",".join(f"field.pose.pose.{name}" for name in (*(f"position.{axis}" for axis in "xyz"),
+                                                                *(f"orientation.{axis}" for axis in "xyzw")))),
+        "nanoseconds since 1970, quaternion x y z w"),
+    "AirSim": (
+        "VehicleName\tTimeStamp\tPOS_X\tPOS_Y\tPOS_Z\tQ_W\tQ_X\tQ_Y\tQ_Z\n"
+        + lines(["Car"] * COUNT, MS, X, Y, ZERO, QW, *LEVEL, QZ, separator="\t"), "quaternion w x y z"),
+    "VINS-Fusion": (lines(NS, X, Y, ZERO, QW, *LEVEL, QZ, *[ZERO] * 3, [""] * COUNT, separator=","), "EuRoC, 60 rows"),
+    "x, y and yaw without names": (lines(S, X, Y, YAW), "seconds since 1970, yaw in radians"),
+    "angles without names": (lines(S, X, Y, ZERO, *LEVEL, YAW), "seconds since 1970, yaw in radians"),
+    "PandaSet": (
+        lines(S, X, Y, ZERO, QW, *LEVEL, QZ, separator=",", header="t,position.x,position.y,position.z,heading.w,"
+              "heading.x,heading.y,heading.z"), "quaternion w x y z"),
+    "json by times": (
+        json.dumps(dict(zip(map(str, TIMES.tolist()), MATRICES.tolist(), strict=True))), "matrices, 60 rows"),
     "theta": (lines(S, X, Y, YAW, separator=",", header="t,x,y,theta"), "yaw in radians"),
     "indices": (lines(range(COUNT), X, Y, YAW, separator=",", header="frame,x,y,yaw"), "the times of the frames"),
     "json": (json.dumps({"poses": [

@@ -16,7 +16,7 @@ ALL_AXES = [
 ]  # of a vehicle: the directions of x, y and z
 USUAL_AXES = ("flu", "frd", "rfu", "rdf")
 LEFT_HANDED = ("ruf", "fru")  # of Unity and Unreal
-CAMERA_AXES = {"optical": "rdf", "vehicle": "flu", "opengl": "rub", "unity": "ruf", "unreal": "fru"}
+CAMERA_AXES = {"optical": "rdf", "vehicle": "flu", "opengl": "rub", "unity": "ruf", "unreal": "fru", "ned": "frd"}
 ORDERS = {order: f"quaternion {' '.join(order)}" for order in ("wxyz", "xyzw")}
 ANGLES = {"vector": "rotation vectors"} | {unit: f"roll, pitch and yaw in {unit}" for unit in ("radians", "degrees")}
 ANGLES |= {"clockwise": f"{ANGLES['degrees']}, clockwise", "clockwise-radians": f"{ANGLES['radians']}, clockwise"}

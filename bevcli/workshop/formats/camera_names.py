@@ -13,7 +13,7 @@ SHORT = {
 }  # fmt: skip
 WORD = re.compile(r"camera|cam|image|img|front|forward|back|rear|left|right|[a-z]+|\d+")
 NUMBERED = re.compile(r"(image|img)_?\d+")  # such as image_2 of KITTI
-ANY = {"camera", "cam", "image", "img"}  # words that tell no camera from another
+ANY = {"camera", "cam", "image", "img", "raw"}  # words that tell no camera from another
 DIRECTIONS = {"front", "back", "left", "right"}
 INSIDE = ("data", "data_rect")  # folders in that of a camera
 LOOKED_AT = 50  # entries of a folder

@@ -3,13 +3,15 @@
 Autoware and URDF state x, y, z, roll, pitch and yaw of each frame from its parent, in metres and radians. Autoware has
 two files: `sensors_calibration.yaml` places the kit of sensors on the vehicle (`base_link`), and
 `sensor_kit_calibration.yaml` the cameras on the kit. The frame of a camera is that of its body, `camera0/camera_link`
-with x forward, y left, z up, or that of its image, `camera0/camera_optical_link`.
+with x forward, y left, z up, or that of its image, `camera0/camera_optical_link`. ROS prints such frames as messages
+with a quaternion (`/tf_static`). Apollo has one such message a file, whose frame does not tell the axes of the camera.
 
 CARLA has lists of sensors: those of an agent of its leaderboard, and `objects.json` of its ROS bridge. A sensor has x,
 y, z in metres and roll, pitch, yaw in degrees. The axes are x forward, y right, z up, with yaw to the right and pitch
 upwards; in a `spawn_point` of the ROS bridge they are those of ROS. A camera has a field of view.
 
 ORB-SLAM names the camera in its settings: Camera.fx, or Camera1.fx and Camera2.fx of two. Waymo has nine intrinsics.
+Basalt has the poses and the intrinsics of cam0, cam1 in lists.
 """
 
 import re
@@ -18,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import cv2
 import numpy as np
 
 from bevcli.errors import InputError
@@ -32,10 +35,13 @@ NUMBERS = ("x", "y", "z", "roll", "pitch", "yaw")
 ON_VEHICLE, VEHICLE = "sensors_calibration.yaml", "base_link"  # the file beside that of a kit, and its frame
 FRAME = re.compile(r"[/_]?(?:camera_)?(?:base_)?(?P<optical>optical_)?(?:link|frame)$")
 BODY_FROM_OPTICAL = inverse(rigid(rotation=AXES["vehicle"]))
+OTHER_SENSORS = re.compile("lidar|velo|radar|imu|gnss|gps|novatel|base", re.IGNORECASE)  # frames of no camera
+BASALT_LENSES = {"kb4": "fisheye", "pinhole-radtan8": "pinhole"}  # by camera_type; others have their own name
 Frames = dict[str, tuple[str, Array]]  # frame -> its parent, and (4, 4) parent_from_frame
 CARLA_CAMERA, FOV_DEG = "sensor.camera.", 90.0  # begins the type of a sensor; of a camera that states none
 ORB_CAMERA = re.compile(r"Camera(\d*)\.(.+)")
 ORB_LENSES = {"kannalabrandt8": "fisheye", "kannalabrandt": "fisheye"}  # by Camera.type; others are pinhole cameras
+PROJECTIONS, ROUNDED = {"P", "projection_matrix", "lidar2img", "ego2img", "world2img"}, 1e-3  # of K times T
 WAYMO = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 
 
@@ -44,12 +50,31 @@ def with_own_names(document: Any, path: Path) -> Any:
 
     path: the file, beside which Autoware has another one.
     """
-    document = _of_carla(_of_frames(document, path), path)
+    document = _of_basalt(_of_carla(_of_frames(document, path), path))
     return _of_orb_slam(document) if isinstance(document, dict) else document
 
 
 def with_intrinsics_by_name(entry: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The statements of a camera, with Waymo's nine numbers by name. The last of nine numbers of a matrix is 1."""
+    """The statements of a camera, with K and T in usual ways.
+
+    Waymo's nine numbers get names: the last of nine of a matrix is 1. MATLAB's K and size are turned round. A
+    projection (`lidar2img`, `P`) is taken apart into K and T where it is not K alone.
+    """
+    matrix = array_of_numbers(entry.get("IntrinsicMatrix"))
+    if matrix is not None and matrix.shape == (3, 3) and matrix[2, :2].any():
+        size = entry.get("ImageSize")
+        return {
+            **entry,
+            "IntrinsicMatrix": matrix.T.tolist(),
+            "ImageSize": size[::-1] if isinstance(size, list) else size,
+        }
+    for key in PROJECTIONS & entry.keys():
+        numbers = array_of_numbers(entry[key])
+        is_matrix = numbers is not None and numbers.shape in ((3, 4), (4, 4))
+        if numbers is not None and is_matrix and np.abs(np.tril(numbers[:3, :3], -1)).max() > ROUNDED:
+            k, rotation, place, *_ = map(np.array, cv2.decomposeProjectionMatrix(numbers[:3]))
+            camera_from_ego = rigid(-rotation @ place[:3, 0] / place[3, 0], rotation)
+            return {**entry, key: None, "K": (k / k[2, 2]).tolist(), "T_camera_ego": camera_from_ego.tolist()}
     for key in ("intrinsic", "intrinsics"):
         numbers = array_of_numbers(entry.get(key))
         if numbers is not None and numbers.shape == (9,) and numbers[8] != 1:
@@ -58,19 +83,46 @@ def with_intrinsics_by_name(entry: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _of_frames(document: Any, path: Path) -> Any:
-    frames = _frames(document, path)
+    stamped = _stamped(document, path)
+    frames, own = stamped or _frames(document, path), []
+    own = list(frames)
     beside = path.parent / ON_VEHICLE
-    if frames and VEHICLE not in (parent for parent, _ in frames.values()) and is_there(beside):
+    if stamped:
+        files = [file for file in path.parent.glob("*.yaml") if file != path]
+        frames = {name: at for file in files for name, at in _stamped(read_yaml(file), file).items()} | frames
+    elif frames and VEHICLE not in (parent for parent, _ in frames.values()) and is_there(beside):
         frames |= _frames(read_yaml(beside), beside)
     cameras: dict[str, dict[str, Any]] = {}
-    for frame in sorted(frames, key=lambda name: "optical" in name):  # the frame of the image replaces that of the body
+    for frame in sorted(own, key=lambda name: "optical" in name):  # the frame of the image replaces that of the body
         match = FRAME.search(frame)
-        if match is not None and "cam" in frame.lower():
+        is_camera = match is not None and "cam" in frame.lower()
+        if is_camera or (stamped and match is None and not OTHER_SENSORS.search(frame)):
             root, root_from_frame = _from_root(frames, frame)
-            matrix = root_from_frame if match["optical"] else root_from_frame @ BODY_FROM_OPTICAL
-            name = "ego_from_camera" if root == VEHICLE else "T_rig_camera"
-            cameras[frame[: match.start()] or frame] = {name: matrix.tolist()}
-    return cameras or document  # cameras by their names may have such numbers too
+            matrix = root_from_frame if match is None or match["optical"] else root_from_frame @ BODY_FROM_OPTICAL
+            name = "ego_from_camera" if match and root == VEHICLE else "T_rig_camera"
+            cameras[(frame[: match.start()] if match else "") or frame] = {name: matrix.tolist()}
+    return cameras or ({} if stamped else document)  # cameras by their names may have such numbers too
+
+
+def _stamped(document: Any, path: Path) -> Frames:
+    """The frames of messages geometry_msgs/TransformStamped; none for another document."""
+    frames: Frames = {}
+    messages = document.get("transforms", [document]) if isinstance(document, dict) else []
+    for each in messages if isinstance(messages, list) else []:
+        header, transform = (each.get(name) for name in ("header", "transform")) if isinstance(each, dict) else (0, 0)
+        if not isinstance(header, dict) or not isinstance(transform, dict) or "child_frame_id" not in each:
+            return {}
+        parts = [(transform.get(name), axes) for name, axes in (("rotation", "wxyz"), ("translation", "xyz"))]
+        rotation, translation = (
+            array_of_numbers([of.get(axis) for axis in axes]) if isinstance(of, dict) else None for of, axes in parts
+        )
+        name = str(each["child_frame_id"])
+        if rotation is None or translation is None or not np.isfinite([*rotation, *translation]).all():
+            raise InputError(
+                f"{path}: {name}: transform: expected finite numbers x, y, z of translation, and of rotation w"
+            )
+        frames[name] = str(header.get("frame_id")), rigid(translation, rotation_from_quaternion(rotation))
+    return frames
 
 
 def _frames(document: Any, path: Path) -> Frames:
@@ -154,6 +206,25 @@ def _carla_camera(sensor: dict[str, Any], path: Path) -> dict[str, Any]:
         "width": width, "height": height, "K": [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]],
         "ego_from_camera": (_parent_from_frame(translation, angles) @ BODY_FROM_OPTICAL).tolist(),
     }  # fmt: skip
+
+
+def _of_basalt(document: Any) -> Any:
+    """The cameras of Basalt's lists; other documents as they are."""
+    value = document.get("value0") if isinstance(document, dict) else None
+    lists = [value.get(name) for name in ("T_imu_cam", "intrinsics", "resolution")] if isinstance(value, dict) else []
+    if not lists or not all(isinstance(each, list) for each in lists):
+        return document
+    cameras: dict[str, dict[str, Any]] = {}
+    for index, (pose, camera, size) in enumerate(zip(*lists, strict=False)):
+        if not isinstance(pose, dict) or not isinstance(camera, dict) or not isinstance(camera.get("intrinsics"), dict):
+            return document
+        kind = str(camera.get("camera_type"))
+        cameras[f"cam{index}"] = {
+            **camera["intrinsics"], "camera_model": BASALT_LENSES.get(kind, kind), "resolution": size,
+            "T_imu_cam": {"translation": [pose.get(f"p{axis}") for axis in "xyz"],
+                          "rotation_xyzw": [pose.get(f"q{axis}") for axis in "xyzw"]},
+        }  # fmt: skip
+    return {"cameras": cameras}
 
 
 def _of_orb_slam(document: dict[Any, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from bevcli.parsing.files import read_bytes
 from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
-from bevcli.workshop.formats.dialects import urdf_document, with_intrinsics_by_name, with_own_names
+from bevcli.workshop.formats.dialects import PROJECTIONS, urdf_document, with_intrinsics_by_name, with_own_names
 from bevcli.workshop.formats.markup import YAML_BYTES, parse_xml, read_yaml
 from bevcli.workshop.formats.pose_readings import quaternions_of_angles
 from bevcli.workshop.formats.pose_table import number_of
@@ -29,13 +29,15 @@ from bevcli.workshop.formats.pose_table import number_of
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".urdf")
 # Names of values, in lower case and without signs: camera_matrix, cameraMatrix and CameraMatrix are one name.
 INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix", "mtx", "cameraintrinsic",
-              "camintrinsic", "projectionparameters", "p", "projectionmatrix", "cameramat")  # fmt: skip
+              "camintrinsic", "projectionparameters", "p", "projectionmatrix", "cameramat", "cammatrix")  # fmt: skip
 LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
         "distortionparameters")  # fmt: skip
 LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
 WIDTH, HEIGHT = ("width", "imagewidth", "w"), ("height", "imageheight", "h")
 SIZE = ("resolution", "imagesize", "size")
 FOCAL = ("f", "focallength")
+FX, FY = ("fx", "flx", "focallengthxpx", *FOCAL), ("fy", "fly", "focallengthypx", "fx", *FOCAL)
+CX, CY = ("cx", "ppx", "u0", "focalcenterxpx"), ("cy", "ppy", "v0", "focalcenterypx")
 TRANSFORM = (
     "t",
     "extrinsics",
@@ -46,13 +48,18 @@ TRANSFORM = (
     "rt",
     "extrinsicmatrix",
     "cameraextrinsicmat",
+    "matrixworld",
+    "view",
 )
 ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "quaternion", "quaternionwxyz",
-            "quaternionxyzw", "q", "qvec", "rvec", "orientation", "rpy", "euler", "eulerangles")  # fmt: skip
+            "quaternionxyzw", "q", "qvec", "rvec", "orientation", "rpy", "ypr", "euler", "eulerangles", "rotationeuler",
+            "rotationvector")  # fmt: skip
+UNIT = re.compile("(deg|rad)(rees|ians)?$")  # ends the name of an angle
 ANGLES = ("roll", "pitch", "yaw")
 TRANSLATION = ("translation", "t", "position", "tvec", "location", "xyz")
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 CAMERA_FRAMES = r"camera\d*|cam\d*|sensor|c"
+FIRST_CAMERAS = ("cam0", "camera0", "c0")
 EGO_FRAMES = "ego|vehicle|car|base|body|imu|rig|world|lidar|velo|b"
 EXACT: dict[str, Direction] = {"egofromcamera": "ego_from_camera", "camerafromego": "camera_from_ego"}
 COEFFICIENTS = {
@@ -90,8 +97,8 @@ def files_in(folder: Path) -> list[Path]:
 
 
 def _stem(path: Path) -> str:
-    """The camera of a file: its name, or that of its folder for EuRoC's cam0/sensor.yaml."""
-    return path.parent.name if path.name == "sensor.yaml" else path.stem
+    """The camera of a file: its name, without _intrinsics, or that of its folder for EuRoC's cam0/sensor.yaml."""
+    return path.parent.name if path.name == "sensor.yaml" else re.sub("_(in|ex)trinsics?$", "", path.stem)
 
 
 def read_document(path: Path) -> Any:
@@ -125,16 +132,20 @@ def cameras_of(document: Any, path: Path) -> Cameras:
     """The cameras of a document with their K, D and T by name. Raises InputError, which names `path`."""
     document = with_own_names(document, path)
     expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
+    if not document and document is not None:  # frames of other sensors
+        return {}
     if isinstance(document, list):
         document = {"cameras": document}
     if not isinstance(document, dict):
         raise InputError(f"{path}: is no mapping (expected {expected})")
-    entries = _value(document, "cameras", "sensors", "cameracalibrations")
+    entries = _value(document, "cameras", "sensors", "cameracalibrations", "cameradata")
     intrinsics, extrinsics = (_value(document, f"{key}s", key) for key in ("intrinsic", "extrinsic"))
     if isinstance(intrinsics, dict) and isinstance(extrinsics, dict):  # perhaps a mapping of cameras each
         common = [name for name, of in intrinsics.items() if isinstance(of, (dict, list)) and name in extrinsics]
         entries = {name: {"intrinsics": intrinsics[name], "extrinsics": extrinsics[name]} for name in common} or entries
     if isinstance(entries, list):
+        entries = [{"name": entry["key"], **entry["value"]} if isinstance(entry, dict) and "key" in entry
+                   and isinstance(entry.get("value"), dict) else entry for entry in entries]  # fmt: skip
         names = [str(_value(entry, "name", "cameraname", "id", "channel", "sensorid") or f"camera{index}")
                  if isinstance(entry, dict) else f"{index}" for index, entry in enumerate(entries)]  # fmt: skip
         for name in (name for index, name in enumerate(names) if name in names[:index]):
@@ -143,7 +154,10 @@ def cameras_of(document: Any, path: Path) -> Cameras:
     if not isinstance(entries, dict) and _is_camera(document):
         entries = {str(_value(document, "cameraname", "name") or _stem(path)): document}
     if not isinstance(entries, dict):
-        entries = {name: entry for name, entry in document.items() if _is_camera(entry)}
+        inside = [document, *(value for value in document.values() if isinstance(value, dict))]
+        entries = next(
+            filter(None, ({name: of for name, of in each.items() if _is_camera(of)} for each in inside)), None
+        )
     if not entries:
         raise InputError(f"{path}: has no camera (expected {expected})")
     for name, entry in entries.items():
@@ -156,7 +170,7 @@ def _is_camera(entry: Any) -> bool:
     """True for a mapping with intrinsics or a pose."""
     if not isinstance(entry, dict):
         return False
-    names = {*INTRINSICS, "fx", *EXACT, *TRANSFORM, *ROTATION, *ANGLES}
+    names = {*INTRINSICS, *FX[:-2], *map(_plain, PROJECTIONS), *EXACT, *TRANSFORM, *ROTATION, *ANGLES}
     return any(_plain(key) in names or _direction_of(str(key)) is not None for key in entry)
 
 
@@ -206,7 +220,7 @@ def _camera_matrix(value: Any, entry: Mapping[str, Any], where: str) -> Any:
     elif isinstance(value, dict) and (inner := _value(value, *INTRINSICS)) is not None:
         return _camera_matrix(inner, value, where)
     elif value is None or isinstance(value, dict):
-        value = [_value(entry, *names) for names in (("fx", *FOCAL), ("fy", "fx", *FOCAL), ("cx",), ("cy",))]
+        value = [_value(entry, *names) for names in (FX, FY, CX, CY)]
         if value == [None] * 4:
             return None
     array = array_of_numbers(value)
@@ -260,7 +274,12 @@ def lens_fields(model: object, coefficients: object, where: str) -> Fields:
 
 def _pose(entry: Mapping[str, Any], where: str) -> StatedPose | None:
     """The pose of a camera under a name that states its direction, or under another one."""
-    for key, value in entry.items():
+    roots = [str(key).removesuffix("_rotation") for key in entry if str(key).endswith("_rotation")]
+    entry = {
+        **{root: {part: entry.get(f"{root}_{part}") for part in ("rotation", "translation")} for root in roots}, **entry
+    }  # fmt: skip
+    # Poses from another camera tell less than those on the vehicle.
+    for key, value in sorted(entry.items(), key=lambda item: str(item[0]).lower().count("cam") > 1):
         exact = EXACT.get(_plain(key))
         direction = exact or _direction_of(str(key))
         if exact and isinstance(value, dict):
@@ -284,17 +303,21 @@ def _pose(entry: Mapping[str, Any], where: str) -> StatedPose | None:
 
 def _direction_of(key: str) -> Direction | None:
     """The direction that a name states, such as T_cam_ego, cam2ego, camera_to_vehicle; None for another name."""
-    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower()
+    words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower().replace("_se3_", "_from_").strip("_")
     words = re.sub(r"(?<=[a-z])2(?=[a-z])", "_to_", re.sub("base_link|vehicle_frame", "base", words))
     match = re.fullmatch(
         rf"(?:t_|tf_)?({CAMERA_FRAMES}|{EGO_FRAMES})_(?:(from|to|t)_)?({CAMERA_FRAMES}|{EGO_FRAMES})", words
     )
     if key in ("T_BS", "T_bs"):
         return "ego_from_camera"  # EuRoC: body and sensor
-    if match is None or bool(re.fullmatch(CAMERA_FRAMES, match[1])) == bool(re.fullmatch(CAMERA_FRAMES, match[3])):
+    if match is None:
         return None
-    from_first = bool(re.fullmatch(CAMERA_FRAMES, match[1]))
-    return "ego_from_camera" if from_first == (match[2] == "to") else "camera_from_ego"
+    are_cameras = [bool(re.fullmatch(CAMERA_FRAMES, match[end])) for end in (1, 3)]
+    if all(are_cameras):  # the frame of the first camera is that of the rig
+        are_cameras = [match[end] not in FIRST_CAMERAS for end in (1, 3)]
+    if are_cameras[0] == are_cameras[1]:
+        return None
+    return "ego_from_camera" if are_cameras[0] == (match[2] == "to") else "camera_from_ego"
 
 
 def _matrices(value: Any) -> dict[str, Array]:
@@ -302,8 +325,8 @@ def _matrices(value: Any) -> dict[str, Array]:
     if isinstance(value, dict) and "data" in value:
         value = value["data"]
     if isinstance(value, dict):
-        plain = {_plain(key): item for key, item in value.items()}
-        plain = _with_vectors(plain)
+        units = {match[1] for key in value if (match := UNIT.search(_plain(key)))}
+        plain = _with_vectors({UNIT.sub("", _plain(key)): item for key, item in value.items()})
         rotation = next(((name, plain[name]) for name in ROTATION if plain.get(name) is not None), None)
         # Under "T" and "t", a translation has three numbers.
         translation = next(
@@ -311,7 +334,9 @@ def _matrices(value: Any) -> dict[str, Array]:
         )
         if rotation is None or translation is None:
             return {}
-        return {order: rigid(translation.ravel(), item) for order, item in _rotations(*rotation).items()}
+        rotations = _rotations(*rotation)
+        kinds = [kind for kind in rotations if units and any(unit in kind or kind == "clockwise" for unit in units)]
+        return {kind: rigid(translation.ravel(), rotations[kind]) for kind in kinds or rotations}
     array = _numbers(value)
     if array is None or array.size not in (12, 16):
         return {}
@@ -325,13 +350,18 @@ def _matrices(value: Any) -> dict[str, Array]:
 def _with_vectors(plain: Fields) -> Fields:
     """A mapping whose x, y, z, roll, pitch and yaw are one translation and one rotation."""
     parts = {"rpy": ANGLES, "xyz": "xyz", "rotationwxyz": ("qw", "qx", "qy", "qz"), "translation": ("tx", "ty", "tz")}
+    axes = [array_of_numbers(plain.get(name)) for name in ("xaxis", "yaxis")]
+    x, y = (axis / np.linalg.norm(axis) if axis is not None and axis.any() else np.zeros(0) for axis in axes)
+    if len(x) == len(y) == 3:  # Audi's
+        turn = np.column_stack([x, y, np.cross(x, y)])
+        plain = plain | {"rotation": turn.tolist(), "translation": plain.get("origin")}
     vectors = {name: [plain.get(part) for part in of] for name, of in parts.items()}
     return plain | {name: numbers for name, numbers in vectors.items() if None not in numbers}
 
 
 def _numbers(value: Any) -> Array | None:
     if isinstance(value, dict):
-        value = value.get("data", [value.get(axis) for axis in "xyz"])
+        value = value.get("data", value.get("coefficients", [value.get(axis) for axis in "xyz"]))
     return array_of_numbers(value)
 
 
@@ -359,7 +389,8 @@ def _rotations(name: str, value: Any) -> dict[str, Array]:
 def _rotations_of_three(name: str, numbers: Array) -> dict[str, Array]:
     """(3, 3) rotations by what three numbers may be: a rotation vector, or roll, pitch and yaw in either unit."""
     rotations, largest = {}, float(np.abs(numbers).max())
-    if largest <= LARGEST_RADIANS and name not in ("rpy", "euler", "eulerangles"):
+    numbers = numbers[::-1] if name == "ypr" else numbers
+    if largest <= LARGEST_RADIANS and name not in ("rpy", "ypr", "euler", "eulerangles", "rotationeuler"):
         rotations["vector"] = np.asarray(cv2.Rodrigues(numbers)[0], dtype=np.float64)
     if name not in ("rvec", "r"):
         mirrored = numbers * [1, -1, -1]  # pitch and yaw

@@ -23,6 +23,7 @@ from bevcli.workshop.formats.markup import parse_xml
 
 VECTOR, QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 MATRIX = tuple(f"m{row}{column}" for row in range(3) for column in range(4))  # world_from_camera, row by row
+ANGLES = ("roll", "pitch", "yaw")
 TUM = ("time", *VECTOR, "qx", "qy", "qz", "qw")
 ROTATION_VECTOR = ("rx", "ry", "rz")
 LAST_ROW = ("m30", "m31", "m32", "m33")
@@ -40,8 +41,9 @@ UNNAMED = [
         [f"m{row}{column}" for column in range(4) for row in range(4)],
     )
     for time in ((), ("time",))
-]
-EUROC = ("time", *VECTOR, *QUATERNION)  # and velocities and biases, which are left out
+] + [("time", *VECTOR, *ANGLES), ("time", *VECTOR[:2], "yaw"), (*VECTOR, *ANGLES)]
+EUROC = ("time", *VECTOR, *QUATERNION)
+LONGER = (8, 11, 17)  # columns of it: with velocities, as VINS-Fusion's, and with biases; they are left out
 ROTATION_TOLERANCE = 0.01  # of the norm of a quaternion, and of the products of a matrix's rows
 BLOCK = 65_536  # rows whose places in the text are made numbers at once
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
@@ -59,6 +61,7 @@ NAMES = {
        for axis, other in zip(VECTOR, ("east", "north", "up"), strict=True)},
     "down": rf"(?:pos_|ned_)?down{_LENGTH}|(?:pos|ned)_d{_LENGTH}",
     **{f"q{axis}": rf"q_?{axis}|q_\w+_{axis}|{_OF}(?:quat|quaternion|orientation|rotation|rot)[._]?{axis}"
+       rf"|{_OF}(?:heading|attitude)[._]?{axis}"
        for axis in "wxyz"},
     **{name: name for name in MATRIX},
     **{f"r{axis}": rf"r{axis}|(?:rot|rotation|rotation_?vector|rot_?vec|r_?vec|axis_?angle)[._]?{axis}"
@@ -165,7 +168,7 @@ def read_table(path: Path) -> Table | None:
     text, header, spans = table_text(path), "", array("q")
     for number, match in enumerate(_LINE.finditer(text), 1):
         line = match[1].strip()
-        if line.startswith(("#", "%")) or (not spans and re.match("[\"'A-Za-z_]", line)):
+        if line.startswith(("#", "%")) or (not spans and re.match("[\"'A-Za-z_]", line) and not _is_row(line)):
             header = header if spans else line.lstrip("#% ").lower()
         elif line:
             spans.extend((number, *match.span(1)))
@@ -199,14 +202,22 @@ def read_table(path: Path) -> Table | None:
     return table
 
 
+def _is_row(line: str) -> bool:
+    """True for a line with the numbers of a pose, perhaps after a text."""
+    return sum(number_of(cell) is not None for cell in re.split(r"[,;\s]+", line)) >= len(VECTOR)
+
+
 def _unnamed(rows: list[list[float | None]], separator: str | None) -> Sequence[str]:
     """The columns of a table without names, by some of its rows; none where their number is not known."""
     count = len(rows[0])
-    if separator == "," and count in (8, 17):  # EuRoC's own order goes before that of TUM
+    if separator == "," and count in LONGER:  # EuRoC's own order goes before that of TUM
         possible = [EUROC, *UNNAMED]
     else:
         possible = UNNAMED
-    possible = [columns for columns in possible if len(columns) == count or (columns is EUROC and count == 17)]
+    possible = [columns for columns in possible if len(columns) == count or (columns is EUROC and count in LONGER)]
+    lengths = [np.linalg.norm(np.array(row[3:], np.float64)) for row in rows]
+    if max(abs(length - 1) for length in lengths) < 10 * ROTATION_TOLERANCE:  # quaternions with wrong digits
+        possible = [columns for columns in possible if "yaw" not in columns]
     return next((columns for columns in possible if all(_is_rotation(columns, row) for row in rows)),
                 next(iter(possible), ()))  # fmt: skip
 
@@ -216,6 +227,8 @@ def _is_rotation(columns: Sequence[str], row: Sequence[float | None]) -> bool:
     if len(row) < len(columns) or None in row:
         return False
     numbers = dict(zip(columns, np.array(row, np.float64), strict=False))
+    if "yaw" in columns:
+        return True
     if "qw" in columns:
         return bool(abs(np.linalg.norm([numbers[name] for name in QUATERNION]) - 1) < ROTATION_TOLERANCE)
     matrix = np.reshape([numbers[name] for name in MATRIX], (3, 4))[:, :3]
@@ -257,6 +270,10 @@ def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
     for index, name in enumerate(names):
         plain = re.sub(r"\s*[\[(].*", "", name)  # without the unit
         quantity = next((quantity for quantity, pattern in NAMES.items() if re.fullmatch(pattern, plain)), None)
+        if (
+            quantity == "time" and quantity in places and name.endswith("stamp")
+        ):  # that of the message, as rostopic has it
+            del places[quantity]
         if quantity in places:
             both = f'"{names[places[quantity]]}" and "{name}"'
             raise InputError(f"{path}: the columns {both} are both {quantity}: remove one")
@@ -290,7 +307,9 @@ def _of_objects(path: Path, text: str) -> Iterator[str]:
     if len(lines) > 1 and all(line.startswith("{") and line.endswith("}") for line in lines):
         text = "[" + ",\n".join(lines) + "]"
     entries = parse_json(text.encode(), path)
-    if isinstance(entries, dict):
+    if isinstance(entries, dict) and None not in map(number_of, entries):  # by their times
+        entries = [{"time": time, **(of if isinstance(of, dict) else {"pose": of})} for time, of in entries.items()]
+    elif isinstance(entries, dict):
         entries = next((each for each in entries.values() if isinstance(each, list)), [])
     rows = [dict(_flat("", entry)) for entry in entries if isinstance(entry, dict)]
     for index, row in enumerate(rows):

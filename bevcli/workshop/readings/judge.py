@@ -163,11 +163,16 @@ class Judged:
         if not tracks:
             return timed_pairs(self._times)
         at = [track.at(self._times)[0] for track in tracks]
-        ways = [np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1) for each in at]
+        units = [each.states.get("pose_unit", "m") for each in self._poses.readings] or ["m"]
+        of_unit: dict[str, list[Array]] = {}
+        for unit, each in zip(units, at, strict=True):
+            of_unit.setdefault(unit, []).append(np.linalg.norm(np.diff(each[:, :3, 3], axis=0), axis=1))
+        ways = np.stack([np.min(each, axis=0) for each in of_unit.values()])
         turns = inverse(at[0][:-1]) @ at[0][1:]
         turned = Rotation.from_matrix(turns[:, :3, :3]).magnitude()
         return moving_pairs(
-            self._times, *(np.concatenate([[0], np.cumsum(each)]) for each in (np.min(ways, axis=0), turned))
+            self._times,
+            *(np.concatenate([[0], np.cumsum(each)]) for each in (np.prod(ways, axis=0) ** (1 / len(ways)), turned)),
         )
 
     def candidates(self, draft: RigDraft, poses: ReadPoses) -> list[Candidate]:
