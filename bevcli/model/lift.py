@@ -94,9 +94,7 @@ class Lift(nn.Module):
         slopes = self._slopes(seen, scores, rays, distances, slopes)
         along = rays.bearing
         tilt = (along * slopes.mean[:, None, None]).sum(-1)
-        doubt = ((along[..., None, :] * slopes.covariance[:, None, None]).sum(-1) * along).sum(
-            -1
-        )  # the variance of the tilt
+        doubt = ((along[..., None, :] * slopes.covariance[:, None, None]).sum(-1) * along).sum(-1)  # variance of tilt
         level = rays.distances(mean, tilt)
         steps = [x[..., :1] - x[..., 1:2] for x in (distances, level)]
         features = [] if self.reduce is None else [self.reduce(self.dropout(found.features.float()))]
@@ -117,6 +115,7 @@ class Lift(nn.Module):
         # The angle of a code is -yaw - pi / 2: its sine is -cos(yaw), its cosine -sin(yaw).
         codes = [x, y, size[..., 0], size[..., 1], z, size[..., 2], -cos, -sin, 0 * x, 0 * x]
         class_logits = self.class_scale * (logits @ self.known.T) + (1 - self.known.sum(-1)) * UNKNOWN + correction
+        class_logits = class_logits - steps[1].abs()  # where foot and height disagree, one of them is wrong
         class_logits = torch.where(is_box[..., None], class_logits, NO_BOX)
         return class_logits.flatten(1, 2), torch.stack(codes, -1).flatten(1, 2), slopes
 

@@ -331,6 +331,13 @@ def test_a_person_is_put_where_foot_and_height_say(lift: Lift, yaw: float) -> No
     assert codes[0, 0, :2].numpy() == pytest.approx([14 * math.cos(yaw + 0.2), 14 * math.sin(yaw + 0.2)], abs=1.0)
 
 
+def test_a_box_whose_foot_and_height_disagree_scores_less(lift: Lift) -> None:
+    whole = upright(camera(0), 14, 0, 1.75, 0.6)
+    logits, *_ = lifted_of(lift, found([whole, upright(camera(0), 14, 0, 1.2, 0.6)], "person"), camera(0))
+    whole_score, score = logits[0].amax(-1)
+    assert score < whole_score - 0.2
+
+
 def test_all_boxes_tell_how_the_vehicle_pitches(lift: Lift) -> None:
     ahead = [(9.0, -0.4), (13.0, 0.3), (18.0, 0.1), (25.0, -0.2)]
     slopes = {}
