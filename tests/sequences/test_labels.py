@@ -147,7 +147,9 @@ def test_kitti_labels_that_bevcli_exports_are_read_again(tmp_path: Path) -> None
     given = boxes_of_drive(drive)
     camera = drive.rig["CAM_FRONT"]
     write_kitti(given, camera, drive.rig.ego_from_bev, tmp_path / "kitti")
-    labelled = WithLabels(drive, tmp_path / "kitti/label_2")
+    with pytest.raises(InputError, match=r"nor images tell which it is: pass `--labels-camera CAM_FRONT` or "):
+        WithLabels(drive, tmp_path / "kitti/label_2")
+    labelled = WithLabels(drive, tmp_path / "kitti/label_2", LabelOptions(labels_camera="CAM_FRONT"))
     for place in range(2):  # later, the camera does not see both
         found, frame = labelled.load(place).ground_truth, given.frames[place]
         np.testing.assert_allclose(found.centers, frame.boxes.centers, atol=2e-3)
@@ -161,7 +163,7 @@ def test_a_kitti_tracking_file_has_tracks(tmp_path: Path) -> None:
     line = "Car 0 0 0 0 0 9 9 1.5 2 4 {} 1 20 0"
     others = ["1 -1 DontCare -1 -1 -10 1 1 9 9 -1 -1 -1 -1000 -1000 -1000 -10", ""]
     path.write_text("\n".join([*(f"{frame} 3 {line.format(0)}" for frame in range(3)), *others]))
-    labelled = WithLabels(MadeDrive(), path)
+    labelled = WithLabels(MadeDrive(), path, LabelOptions(labels_camera="CAM_FRONT"))
     assert [labelled.load(place).ground_truth.instances.tolist() for place in range(3)] == [["3"]] * 3
     assert np.isfinite(labelled.load(1).ground_truth.velocities).all()
     assert any("those that CAM_FRONT sees" in note for note in labelled.notes)
@@ -209,7 +211,7 @@ def test_convert_writes_the_labels_as_ground_truth(tmp_path: Path) -> None:
 )
 def test_a_box_of_size_0_is_left_out_of_labels(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    labelled = WithLabels(MadeDrive(), tmp_path / name, DOCUMENTED if name == "labels.csv" else LabelOptions())
+    labelled = WithLabels(MadeDrive(), tmp_path / name, replace(DOCUMENTED, labels_camera="CAM_FRONT"))
     assert any("left out: a size of 0 or less" in note for note in labelled.notes)
     boxes = [labelled.load(place).ground_truth for place in range(4)]
     assert all((each.sizes_lwh > 0).all() for each in boxes if each is not None)
@@ -286,6 +288,15 @@ def test_images_show_what_the_boxes_of_one_frame_do_not(street: Drive, tmp_path:
     truth = first.load(0).ground_truth
     truth = truth[truth.classes == "car"][:4]
     np.testing.assert_allclose(found.load(0).ground_truth.to_numpy()[:, :7], truth.to_numpy()[:, :7], atol=1e-6)
+
+
+def test_images_show_of_which_camera_kitti_labels_are(street: Drive, tmp_path: Path) -> None:
+    few = DriveView(street, [0, 3])
+    frames = tuple(FrameBoxes(few.stamps[place], few.load(place).world_from_ego, few.load(place).ground_truth)
+                   for place in range(2))  # fmt: skip
+    write_kitti(BoxesFile("world", frames), few.rig["CAM_FRONT_LEFT"], few.rig.ego_from_bev, tmp_path)
+    found = WithLabels(few, tmp_path / "label_2")
+    assert any("boxes in the frame of CAM_FRONT_LEFT (the images: overlap" in note for note in found.notes)
 
 
 CLASSES = ("Car", "TRUCK", "Tricycle", "lorry", "pedestrian")

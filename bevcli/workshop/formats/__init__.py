@@ -218,7 +218,7 @@ class LabelOptions:
     )
     labels_camera: str | None = option(
         default=None,
-        help="The camera in whose frame KITTI labels are. Default: the one that looks most directly ahead.",
+        help="The camera in whose frame KITTI labels are. Default: image_2, or the one that the images show.",
         metavar="NAME",
     )
     labels_frame: Literal["ego", "world", "bev"] | None = option(

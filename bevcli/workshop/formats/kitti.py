@@ -6,7 +6,7 @@ GPS and IMU, a file for each time. Labels are a tracking file of a drive, or a f
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,6 +46,8 @@ IGNORED = "DontCare"
 # length, the middle of the bottom x, y, z in the frame of the camera, and rotation_y. Predictions add a score.
 WORDS = (15, 16)
 NAMES = ("height", "width", "length", "x", "y", "z", "rotation_y")
+LabelRow = tuple[str, list[str], str]  # where it is, its words from the type on, and its track
+LABELLED = ("image_02", "image_2")  # the camera of KITTI's labels
 OCCLUSION_UNKNOWN = 3
 NEAR_M = 0.1  # box edges are clipped at this depth
 
@@ -53,43 +55,46 @@ NEAR_M = 0.1  # box edges are clipped at this depth
 def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     """The boxes of a tracking file, or of a folder with files NNNNNN.txt. Raises InputError that names the line.
 
-    They are in the frame of the camera `labels_camera`; by default of that which looks most directly ahead.
+    They are in the frame of the camera `labels_camera`; by default of image_2, or of any camera: the images decide.
     """
-    name = _looking_ahead(rig) if options.labels_camera is None else options.labels_camera
-    if name not in rig.names:
+    cameras = sorted(rig.cameras, key=lambda camera: abs(camera.yaw))
+    name = options.labels_camera or next((name for name in LABELLED if name in rig.names), None)
+    if name is not None and name not in rig.names:
         raise InputError(
             f"`labels_camera={name}` (`--labels-camera`): is not in the rig (expected one of {', '.join(rig.names)})"
         )
-    frames = _folder(path, rig[name]) if path.is_dir() else _tracking_file(path, rig[name])
-    note = (
-        f"the boxes are those that {name} sees, in its frame (`labels_camera` (`--labels-camera`)); others have no "
-        "labels"
-    )
-    return Labels(USUAL, tuple(frames), lists_empty=path.is_dir(), notes=(note,))
+    cameras = cameras if name is None else [rig[name]]
+    rows = _rows_of_folder(path) if path.is_dir() else _rows_of_tracking_file(path)
+    frames = tuple(_labelled(index, of_frame, cameras) for index, of_frame in rows.items())
+    return Labels(USUAL, frames, lists_empty=path.is_dir())
 
 
 def _looking_ahead(rig: CameraRig) -> str:
     return min(rig.cameras, key=lambda camera: abs(camera.yaw)).name
 
 
-def _folder(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
+def _labelled(index: int, rows: Sequence[LabelRow], cameras: Sequence[Camera]) -> LabelledFrame:
+    by_camera = {camera.name: Boxes3D.concatenate(_box(*row, camera) for row in rows) for camera in cameras}
+    return LabelledFrame(index, None, by_camera[cameras[0].name], by_camera)
+
+
+def _rows_of_folder(path: Path) -> dict[int, list[LabelRow]]:
+    rows: dict[int, list[LabelRow]] = {}
     for file in sorted(path.glob("*.txt")):
         if not file.stem.isdecimal():
             raise InputError(f"{file}: expected the index of a frame as its name, such as 000042.txt")
-        boxes = Boxes3D.concatenate(_box(where, words, "", camera) for where, words in _lines(file))
-        yield LabelledFrame(int(file.stem), None, boxes)
+        rows[int(file.stem)] = [(where, words, "") for where, words in _lines(file)]
+    return rows
 
 
-def _tracking_file(path: Path, camera: Camera) -> Iterator[LabelledFrame]:
-    frames: dict[int, list[Boxes3D]] = {}
+def _rows_of_tracking_file(path: Path) -> dict[int, list[LabelRow]]:
+    rows: dict[int, list[LabelRow]] = {}
     for where, words in _lines(path):
         if not words[0].isdecimal() or len(words) < 2:
             raise InputError(f'{where}: expected the index of a frame and a track, found "{" ".join(words):.40}"')
-        box = _box(where, words[2:], words[1], camera)
-        if len(box):
-            frames.setdefault(int(words[0]), []).append(box)
-    for index, boxes in frames.items():
-        yield LabelledFrame(index, None, Boxes3D.concatenate(boxes))
+        if words[2:3] != [IGNORED]:
+            rows.setdefault(int(words[0]), []).append((where, words[2:], words[1]))
+    return rows
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:

@@ -5,7 +5,7 @@ leaves, one is believed if its boxes lie on the objects that a detector sees in 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise, permutations, product
 from pathlib import Path
 
@@ -58,6 +58,9 @@ class LabelledFrame:
     index: int | None  # of the frame; None if the file has times only
     timestamp_ns: int | None  # of the frame; None if the file has indices only
     boxes: Boxes3D  # in the frame of reference of the file
+    by_camera: Mapping[str, Boxes3D] = field(
+        default_factory=dict
+    )  # the same, as those of each camera that they may be of
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,11 @@ class Labels:
     lists_empty: bool
     notes: tuple[str, ...] = ()
 
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Those that the boxes may be of."""
+        return tuple(self.frames[0].by_camera) if self.frames else ()
+
 
 @dataclass(frozen=True)
 class LabelReading(Reading):
@@ -95,6 +103,7 @@ class LabelReading(Reading):
             "labels_z": "z of the {}".format,
             "labels_yaw": lambda yaw: f"yaws {YAWS[yaw][0]}",
             "labels_yaw_unit": "yaws in {}".format,
+            "labels_camera": "boxes in the frame of {}".format,
         }
         return ", ".join(words[name](value) for name, value in self.states.items() if not names or name in names)
 
@@ -110,6 +119,7 @@ class PlacedBoxes:
     scene: str  # of the frame
     boxes: Boxes3D  # as the file has them
     world_from: Mapping[str, Array]  # (4, 4) by frame of reference
+    by_camera: Mapping[str, Boxes3D] = field(default_factory=dict)
 
     @property
     def ego(self) -> Array:
@@ -118,7 +128,8 @@ class PlacedBoxes:
 
     def read_as(self, states: Mapping[str, str]) -> Boxes3D:
         """The boxes in the world frame, as a reading with these states has them."""
-        return read_as(states, self.boxes).transformed(self.world_from[states["labels_frame"]])
+        boxes = self.by_camera.get(states.get("labels_camera", ""), self.boxes)
+        return read_as(states, boxes).transformed(self.world_from[states["labels_frame"]])
 
 
 def read_as(states: Mapping[str, str], boxes: Boxes3D) -> Boxes3D:
@@ -231,7 +242,7 @@ def decided(
     if len(left) > 1:
         names = differing(left)
         why = "neither boxes nor images tell which it is"
-        if len(left) <= MOST_NAMED:
+        if len(left) <= MOST_NAMED or len(names) == 1:
             raise question(path, why, left)
         options = ", ".join(f"`{name}` (`--{name.replace('_', '-')}`)" for name in names)
         raise InputError(
@@ -239,6 +250,9 @@ def decided(
             f"`{LabelReading(USUAL).flags(names)}` where it is as documented"
         )
     states, notes = chosen.states, list(chosen.notes)
+    if "labels_camera" in states:
+        sees = f"the boxes are those that {states['labels_camera']} sees, in its frame"
+        notes.append(f"{sees} (`labels_camera` (`--labels-camera`)); others have no labels")
     if states["labels_yaw_unit"] == "degrees" and "labels_yaw_unit" not in stated:
         notes.append(f"the yaws, of up to {_largest_yaw(frames):.0f}, are taken to be in degrees")
     if states["labels_frame"] == "ego" and "labels_frame" not in stated:

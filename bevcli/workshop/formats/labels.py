@@ -50,7 +50,12 @@ def read_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labels:
     else:
         expected = "KITTI labels (.txt, or a folder of these), or a table (.csv) with frame or timestamp_ns, class, "
         raise InputError(f"{path}: is no file of labels (expected {expected}{', '.join(NUMBERS)}): convert it to one")
-    frames = tuple(replace(labelled, boxes=labelled.boxes.possible()) for labelled in labels.frames)
+    frames = tuple(
+        replace(
+            each, boxes=each.boxes.possible(), by_camera={name: of.possible() for name, of in each.by_camera.items()}
+        )
+        for each in labels.frames
+    )
     left_out = sum(len(labelled.boxes) for labelled in labels.frames) - sum(len(labelled.boxes) for labelled in frames)
     note = (f"{counted(left_out, 'boxes')} {IMPOSSIBLE}",) if left_out else ()
     labels = replace(labels, frames=frames, notes=(*labels.notes, *note))
@@ -140,13 +145,15 @@ def _in_world(
         frame = sequence.ground_truth_frame(index)
         ego = frame.world_from_ego.matrix
         world_from = {"ego": ego, "bev": ego @ frame.rig.ego_from_bev, "world": np.eye(4)}
-        placed[index] = PlacedBoxes(frame.stamp.scene, labelled.boxes, world_from)
+        placed[index] = PlacedBoxes(frame.stamp.scene, labelled.boxes, world_from, labelled.by_camera)
     stated = {name: value for name in USUAL if (value := getattr(options, name)) is not None}
     stated = {**labels.states, **stated}
     if stated.get("labels_frame") == "world" and not sequence.has_ego_motion:
         raise InputError(f"{path}: its boxes are in the world frame, but the drive has no ego_motion.csv: add it")
     frames = [placed[index] for index in sorted(placed)]
     left = fitting(path, frames, stated)
+    of_cameras = [replace(left[0], states={**left[0].states, "labels_camera": name}) for name in labels.cameras]
+    left = of_cameras[: None if any(len(each.boxes) for each in frames) else 1] or left
     if len(left) > 1 or left[0].doubt:
         from bevcli.workshop.trust.witness import shown_by_images
 

@@ -88,7 +88,7 @@ def shown_by_images(
     other, shown = readings[nearest], []
     for reading, fit in zip(left, fits[kept], strict=True):
         names = differing([reading, other])
-        told = [name for name, value in reading.states.items() if name in names or value != USUAL[name]]
+        told = [name for name, value in reading.states.items() if name in names or value != USUAL.get(name)]
         note = f"{reading.words(told)} (the images: overlap {fit:.2f}; {other.words(names)}: {fits[nearest]:.2f})"
         shown.append(replace(reading, notes=(*reading.notes, note)))
     return shown
