@@ -246,6 +246,12 @@ def test_angles_that_nothing_decides_are_readings(unit, turn, tmp_path):
     assert read(tmp_path, standing("0.5")).motion.velocities == pytest.approx(0)  # one that does not turn needs no unit
 
 
+def test_w_first_is_no_usual_reading_of_tum(tmp_path):
+    """It is believed only where it fits much better: a vehicle that stands shows nothing."""
+    found = read(tmp_path, lines(S, ZERO, ZERO, ZERO, *LEVEL, QZ, QW))
+    assert {each.states["pose_angles"] for each in found.readings if not each.rank} == {"xyzw"}
+
+
 def test_times_of_frames_that_are_not_known_are_asked_for(circle, tmp_path):
     for name in ("tum", "yaw in degrees, milliseconds", "gps"):
         found = read(tmp_path, FORMATS[name][0], frames=None)

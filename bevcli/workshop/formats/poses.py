@@ -317,7 +317,9 @@ def _units(positions: Array, times_ns: NDArray[np.int64], drive: DrivePoses) -> 
 
 
 def _is_unusual(angles: str, table: Table) -> bool:
-    """True for angles that are seldom meant by a name of a column."""
+    """True for angles that are seldom meant by a name of a column, and for a quaternion that TUM does not have."""
+    if angles == "wxyz" and tuple(table.columns) == TUM and table.separator in (None, "\t"):
+        return True
     is_of_north = table.has("heading") or table.has("latitude")
     return angles.startswith("clockwise") or (angles.startswith("compass") and not is_of_north)
 

@@ -57,7 +57,7 @@ MOST_SLOW = 0.9  # share of the steps that must not be too fast
 BOTH = ("rig_axes", "pose_axes")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Candidate:
     """A reading of the rig and one of the poses, together."""
 
@@ -156,6 +156,7 @@ class Judged:
         self._times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
         self._pairs = list(camera_pairs(drive, self._frames())) if options.image_check else []
         self._points = MatchedPoints(self._pairs) if self._pairs else None
+        self._heights: dict[Candidate, float | None] = {}
 
     def _frames(self) -> list[tuple[int, int]]:
         """The pairs of frames that are compared."""
@@ -438,8 +439,10 @@ class Judged:
         """The mean height of the cameras above the road by the images, metres; None where it is not clear."""
         if self._points is None or self._poses.motion is None:
             return None
-        seen = height_above_road(self._points, chosen.cameras, chosen.steps)
-        return None if seen is None or seen.clearness < CLEAR_HEIGHT else seen.height_m
+        if chosen not in self._heights:
+            seen = height_above_road(self._points, chosen.cameras, chosen.steps)
+            self._heights[chosen] = None if seen is None or seen.clearness < CLEAR_HEIGHT else seen.height_m
+        return self._heights[chosen]
 
 
 def _tracks(poses: ReadPoses, times_ns: NDArray[np.int64]) -> dict[int, Poses]:
