@@ -20,6 +20,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.preprocess import check_cameras, checked_images
 from bevcli.inference.runner import RunnerState, one_command
 from bevcli.options import refuse, spread
+from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.workshop.odometry.measure import LiveMotion, RecentPoses
 
 RIGID_TOLERANCE = 1e-3  # of a pose matrix: sensors and simulators often compute it in float32
@@ -213,6 +214,8 @@ class Session:
             found = f"{type(timestamp_ns).__name__} {timestamp_ns!r:.40}"
             advice = "pass round(seconds * 1e9)" if isinstance(timestamp_ns, float | np.floating) else "pass an int"
             raise InputError(f"`timestamp_ns`: expected whole nanoseconds (found {found}): {advice}") from None
+        if abs(time) > LARGEST_INTEGER:
+            raise InputError("`timestamp_ns`: is too large (expected nanoseconds, at most 62 bits)")
         if self._last_ns is not None and time <= self._last_ns:
             raise InputError(
                 f"`timestamp_ns={time}`: is not later than the frame before ({self._last_ns}): pass frames in order, "

@@ -81,6 +81,8 @@ def test_frames_out_of_order_change_nothing(model):
         assert_same(step(session, drive.load(place)), expected[place])
         with pytest.raises(InputError, match=r"is not later than the frame before .*reset\(\)"):
             step(session, drive.load(place))
+        with pytest.raises(InputError, match=r"`timestamp_ns`: is too large"):
+            step(session, drive.load(place), timestamp_ns=2**63)
 
 
 WRONG_IMAGES = [
