@@ -84,7 +84,7 @@ gpu-check: $(DEVELOPER)
 
 fuzz: $(DEVELOPER)
 	OMP_NUM_THREADS=1 BEVCLI_FUZZ_CASES=$${BEVCLI_FUZZ_CASES:-150} BEVCLI_FUZZ_SHARE=$${BEVCLI_FUZZ_SHARE:-1} \
-		$(BIN)/pytest --numprocesses 2 --max-worker-restart 0 tests/fuzz tests/tools/fuzz
+		$(BIN)/pytest --numprocesses 2 --max-worker-restart 0 tests/tools/fuzz
 
 check: $(DEVELOPER)
 	$(BIN)/ruff check .
