@@ -133,7 +133,7 @@ def open_with_bar(path: Path, options: "InputOptions", format_options: Mapping[s
     from bevcli.sequences.open import open_steps
 
     with opening(path) as told:
-        return last_of_steps(_telling(open_steps(path, options, **format_options), told))
+        return last_of_steps(open_steps(path, options, **format_options), told)
 
 
 @contextmanager
@@ -154,18 +154,16 @@ def _tell_opening(path: Path, told: threading.Event) -> None:
         silence *= 2
 
 
-def _telling(steps: Iterable[T], told: threading.Event) -> Iterator[T]:
-    """The steps, which set the event."""
-    for step in steps:
-        told.set()
-        yield step
+def last_of_steps(steps: Iterable[tuple[int, int] | T], told: threading.Event | None = None) -> T:
+    """The last of some items. Those before it are shown: steps of the ego-motion that are measured, and of how many.
 
-
-def last_of_steps(steps: Iterable[tuple[int, int] | T]) -> T:
-    """The last of some items. Those before it are shown: steps of the ego-motion that are measured, and of how many."""
+    told: of `opening`, set by the first item.
+    """
     bar: Progress | None = None
     with ExitStack() as shown:
         for step in steps:
+            if told is not None:
+                told.set()
             if not isinstance(step, tuple):
                 return step
             done, total = step

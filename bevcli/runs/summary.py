@@ -178,7 +178,7 @@ class RunSummary:
             ("stages", f"{stages} (medians)"),
         ]
         if counts.tracks is not None:
-            rows.insert(2, ("tracks", f"{len(counts.tracks)} objects have such boxes"))
+            rows.insert(2, ("tracks", f"{counted(len(counts.tracks), 'objects')} with such boxes"))
         if guessed:
             rows.append(("cameras", f"{', '.join(guessed)} (embeddings; `cameras` (`--camera`) changes them)"))
         if counts.dropped:

@@ -61,9 +61,7 @@ def open_video(path: Path, common: InputOptions, options: FolderOptions) -> Fold
     drive = FolderDrive(path, replace(common, ego_motion="measured") if is_without else common, options, draft)
     drive.name = path.resolve().stem
     if is_without and common.ego_motion != "measured":
-        without = "no history is used, and boxes are in the ego frame"
-        note = f"a video has no poses: {without} (`odometry=True` (`--odometry`) measures them from the images)"
-        drive.notes = (*drive.notes, note)
+        drive.notes = (*drive.notes, "a video has no poses: boxes are in the ego frame")
     return drive
 
 

@@ -61,8 +61,9 @@ def write_comparison(
         "precision_recall_of_both.png": draw_both([detection.overall for detection in detections], files),
         "errors_by_range_of_both.png": draw_errors_by_range(detections),
     }
-    for model, detection, of_frames in zip(MODELS, detections, pairs, strict=True):
-        figures[f"misses_and_false_alarms_{model}.png"] = draw_bev_sheet(detection, of_frames)
+    for model, detection, of_frames, file in zip(MODELS, detections, pairs, files, strict=True):
+        name = f"{model}, {str(file)[-60:]}; "
+        figures[f"misses_and_false_alarms_{model}.png"] = draw_bev_sheet(detection, of_frames, name)
     return save_figures(figures, folder)
 
 
@@ -204,7 +205,7 @@ MAX_DOTS = 1500
 _OUTLINES = {"found": ("#3a9a4b", "-"), "missed": ("#d62728", "-"), "false positive": ("#ff9d1e", "--")}
 
 
-def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
+def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs, name: str = "") -> Figure:
     """Draw all missed ground truths and false positives as dots, and below them the frames with most, as boxes.
 
     Each class is cut at the score with the largest F1 at the error distance: an application would keep these boxes. The
@@ -213,7 +214,7 @@ def draw_bev_sheet(detection: DetectionScores, pairs: FramePairs) -> Figure:
     config = detection.config
     outcomes = {matches.name: best_outcome(matches, config.error_row) for matches in detection.matches}
     threshold = f"largest F1 of each class at {config.error_distance_m:g} m"
-    subtitle = f"score threshold: {threshold}; forward is up, rings every 10 m"
+    subtitle = f"{name}score threshold: {threshold}; forward is up, rings every 10 m"
     figure = titled_figure((12, 10), "Missed ground truth and false positives, seen from above", subtitle)
     grid = figure.add_gridspec(2, 2 * WORST_FRAMES, height_ratios=(2, 1.15))
     ranges = [boxes.ranges_m for match in detection.matches for boxes in (match.ground_truth, match.predictions)]

@@ -320,6 +320,7 @@ def _draw_rows(axes: Any, rows: list[Row], skipped: tuple[str, ...], marker: str
             axes.plot([row["step"] for row in rows], values, label=name, marker=marker)
     if rows:
         axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))  # beside the curves
+    axes.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
     axes.grid(alpha=0.3)
 
 
