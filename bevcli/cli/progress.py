@@ -26,7 +26,6 @@ LINES_ON_A_PIPE = 10  # about this many progress lines for a whole run
 SLOW_S = 2.0  # work whose units take longer also gets a line after the first one, and its pace in seconds
 LONGEST_SILENCE_S = 30.0  # between two lines on a pipe, if units are done meanwhile
 OPENING_S = 8.0  # of a drive that is opened, until a line says so
-Part = TypeVar("Part")
 
 
 class Progress:
@@ -77,7 +76,7 @@ class Progress:
             print(self.state(), file=self.stream, flush=True)
             self._printed = time.perf_counter()
 
-    def over(self, parts: Iterable[Part]) -> Iterator[Part]:
+    def over(self, parts: Iterable[T]) -> Iterator[T]:
         """The parts of some work, each of which adds a unit."""
         for part in parts:
             self.advance()
@@ -87,12 +86,6 @@ class Progress:
         """Adds units of work up to this number of them."""
         if done > self.done:
             self.advance(done - self.done)
-
-    def each(self, items: Iterable[T]) -> Iterator[T]:
-        """The items, each a unit of work that is done when the next one is asked for."""
-        for item in items:
-            yield item
-            self.advance()
 
     def skip(self, count: int) -> None:
         """Adds units of work that were done before: they do not count for the rate."""

@@ -137,7 +137,7 @@ def validate(
         raise InputError("--reference is for drives without ground truth: remove it")
     with Progress(total, "frames", notes) as progress:
         runner = loaded.runner(StepOptions(track=options.tracking, temporal=run_options.temporal))
-        frames = progress.each(validation.run_drives(runner, drives))
+        frames = progress.over(validation.run_drives(runner, drives))
         scores = validation.score_drives(runner, drives, options.max_range, each_drive=options.each, frames=frames)
     say(json.dumps(scores.to_dict(), indent=1) if as_json else f"drives  {len(drives)}\n\n{scores.table()}")
 
@@ -165,7 +165,7 @@ def _estimate(
     found = []
     with Progress(frames, "frames", notes) as progress:
         for drive in (some.open(index) for some in drives for index in range(len(some))):
-            parts = list(progress.each(estimate.frames_of_model(model, drive, temporal=temporal)))
+            parts = list(progress.over(estimate.frames_of_model(model, drive, temporal=temporal)))
             found.append((drive.name, parts, replace(held.agreement(parts), findings=faults.find_faults(model, drive))))
     reference = None if options.reference is None else found.pop()[2]
     scores = [(name, score) for name, _, score in found]
