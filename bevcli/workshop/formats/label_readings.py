@@ -47,6 +47,7 @@ NEAR_M, FAR_M = 40.0, 300.0  # of boxes that tell the road; of boxes that are no
 TURNED_RAD, BY_CHANCE = 0.5, 4.6  # yaws that are not near 0; Rayleigh's statistic that chance exceeds once in a hundred
 ASIDE = "neither boxes nor images tell the bev frame from others on the vehicle: pass `--labels-frame bev` if it is"
 WAY_M, DRIVEN_M = 1.0, (0.5, 8.0)  # between two frames: of the vehicle, of driving objects
+RUNS, RUN = 5, 8  # of frames in which motion is looked for
 STANDING_SHARE = 30  # percentage of the boxes that stand
 ALLOWED_M = 0.5  # by which standing boxes move, and by which boxes leave the plane of the road
 
@@ -217,7 +218,7 @@ def _left(
 
 def _unlike(frames: Sequence[PlacedBoxes], readings: Sequence[LabelReading]) -> list[LabelReading]:
     """The readings, without those that put all boxes where an earlier one has them."""
-    kept, places = list[LabelReading](), np.zeros((0, COMPARED, 7))
+    frames, kept, places = _some(frames), list[LabelReading](), np.zeros((0, COMPARED, 7))
     for reading in readings if len(readings) > 1 else ():
         boxes = Boxes3D.concatenate(frame.read_as(reading.states) for frame in frames)
         boxes = boxes[np.linspace(0, len(boxes) - 1, COMPARED).astype(int)] if len(boxes) else boxes
@@ -284,6 +285,7 @@ def _usual_size(name: str) -> tuple[float, float, float] | None:
 
 def _places(frames: Sequence[PlacedBoxes], before: LabelReading) -> Iterator[LabelReading]:
     """Frames of reference and meanings of z, by the road, and by what stands if the vehicle moves."""
+    frames = _some(frames)
     for frame, z in product(FRAMES, ("center", "bottom")):
         reading = {"labels_frame": frame, "labels_z": z}
         world = [each.read_as({**before.states, **reading}) for each in frames]
@@ -311,6 +313,7 @@ def _yaws(frames: Sequence[PlacedBoxes], before: LabelReading) -> Iterator[Label
     """Meanings of yaw: vehicles drive ahead."""
     units = ["degrees", "radians"] if _largest_yaw(frames) > LARGEST_RADIANS else ["radians", "degrees"]
     shown = units[:1] if _are_at_right_angles(frames, units[0]) else units
+    frames = _some(frames)
     for unit, name in product(units, YAWS):
         reading = {"labels_yaw": name, "labels_yaw_unit": unit}
         off = []
@@ -332,6 +335,14 @@ def _are_at_right_angles(frames: Sequence[PlacedBoxes], unit: str) -> bool:
     yaws = wrap_angle(np.radians(yaws) if unit == "degrees" else yaws)
     turned = yaws[np.abs(yaws) > TURNED_RAD]
     return len(turned) >= FEWEST and bool(np.square(np.abs(np.exp(4j * turned).mean())) * len(turned) > BY_CHANCE)
+
+
+def _some(frames: Sequence[PlacedBoxes]) -> Sequence[PlacedBoxes]:
+    """Those of a short drive, or runs of successive frames all over a long one."""
+    if len(frames) <= RUNS * RUN:
+        return frames
+    starts = np.linspace(0, len(frames) - RUN, RUNS).astype(int).tolist()
+    return [frame for start in starts for frame in frames[start : start + RUN]]
 
 
 def _largest_yaw(frames: Sequence[PlacedBoxes]) -> float:
