@@ -225,6 +225,13 @@ def test_poses_of_a_camera_are_a_reading(first_world, circle, tmp_path):
         read(tmp_path, text, poses_of="left")
 
 
+def test_a_world_far_away_is_in_metres_too(tmp_path):
+    """In the frame of a vehicle that turns, its origin moves faster than vehicles do."""
+    far = np.linalg.inv(MATRICES + 10_000 * np.eye(4, k=3))
+    found = read(tmp_path, lines(S, *far[:, :3].reshape(COUNT, 12).T))
+    assert {each.states.get("pose_unit", "m") for each in found.readings} == {"m"}
+
+
 def test_real_kitti_poses_are_those_of_the_folder(shared, tmp_path):
     drive = open_sequence(shared / "data/kitti-straight", ego_motion="optional")
     motion, camera = drive.ego_motion, drive.rig.cameras[0]

@@ -7,7 +7,7 @@ decide; the unit of times follows from the times of the frames. A note says what
 
 import re
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
@@ -35,11 +35,13 @@ from bevcli.workshop.formats.pose_readings import (
     COURSE,
     FASTEST_M_S,
     compared_rows,
+    conjugate,
     in_usual_axes,
     in_usual_units,
     of_bodies,
     of_ego,
     quaternions_of_angles,
+    rotated,
     with_course,
 )
 from bevcli.workshop.formats.pose_table import (
@@ -297,7 +299,7 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
     known = {name: None if drive.rig_is_open else drive.rig[name].ego_from_camera for name in cameras}
     readings = []
-    for unit in _units(positions, times_ns, drive):
+    for unit in _units(positions, rotations.values(), times_ns, drive):
         of_unit = of_bodies(UNITS_M[unit] * positions, rotations, times_ns, known, stated)
         for each in of_unit:
             rank = each.rank + int(drive.stated.pose_angles is None and _is_unusual(each.states["pose_angles"], table))
@@ -306,14 +308,20 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     yield from sorted(readings, key=lambda each: (each.rank, tuple(table.columns) == MATRIX and each.camera != zeroth))
 
 
-def _units(positions: Array, times_ns: NDArray[np.int64], drive: DrivePoses) -> list[str]:
-    """The units that positions may have: other ones than metres where a vehicle would be too fast."""
+def _units(positions: Array, rotations: Iterable[Array], times_ns: NDArray[np.int64], drive: DrivePoses) -> list[str]:
+    """The units that positions may have: other ones than metres where a vehicle would be too fast either way.
+
+    Positions of a world that is far away move fast in the frame of a vehicle that turns.
+    """
     if drive.stated.pose_unit is not None:
         return [drive.stated.pose_unit]
     rows = compared_rows(times_ns)
-    lengths = np.linalg.norm(np.diff(positions[rows], axis=0), axis=1)
-    speed = float(np.median(lengths / np.maximum(np.diff(times_ns[rows]), 1))) * 1e9 if len(lengths) else 0.0
-    return ["m"] if speed < FASTEST_M_S else ["cm", "mm"]
+    seconds = np.maximum(np.diff(times_ns[rows]), 1) / 1e9
+    for at in (positions[rows], *(rotated(conjugate(each[rows]), positions[rows]) for each in rotations)):
+        lengths = np.linalg.norm(np.diff(at, axis=0), axis=1)
+        if not len(lengths) or np.median(lengths / seconds) < FASTEST_M_S:
+            return ["m"]
+    return ["cm", "mm"]
 
 
 def _is_unusual(angles: str, table: Table) -> bool:

@@ -34,6 +34,7 @@ from bevcli.workshop.readings.pairs import (
 
 SOUND_PX = (2.5, 1.0, 0.7)  # largest residual of a reading that is believed, reduced pixels, by its rank
 CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all others are larger
+EXACT, EXACT_PX = 1.5, 0.1  # the same where images and rig are exact (`FLOOR_PX`)
 NEAR, NEAR_PX = 1.25, 0.05  # the same, of readings of which the usual one is believed
 FLOOR_PX = 0.3  # no other reading is clearly better than one with this
 UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the only one
@@ -232,7 +233,9 @@ class Judged:
                 f"{self._files(BOTH)}: in no reading the vehicle drives along its x axis, at most {FASTEST_M_S:g} m/s: "
                 f"correct the poses, or state what they are by {options} or {named(RigOptions, 'pose_transform')}"
             )
-        near, clear = (times * found[0].residual_px + more for times, more in ((NEAR, NEAR_PX), (CLEAR, CLEAR_PX)))
+        least = found[0].residual_px
+        larger = (EXACT, EXACT_PX) if least <= FLOOR_PX else (CLEAR, CLEAR_PX)
+        near, clear = (times * least + more for times, more in ((NEAR, NEAR_PX), larger))
         best = min(found, key=lambda each: (each.residual_px > near, each.rank))
         usual = [each for each in found if each.rank <= best.rank]
         unsound = not best.is_sound or len(self._pairs) < FEWEST_PAIRS
