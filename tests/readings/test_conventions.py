@@ -1,6 +1,7 @@
 """A true drive in the conventions of other programs is read right, or a question names the options that decide."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,8 @@ from tests.readings.stated_drive import Convention, choices_of, opened, write, w
 
 from bevcli.errors import InputError
 from bevcli.sequences.open import open_sequence
+from bevcli.workshop.readings import judge
+from bevcli.workshop.readings.pairs import camera_pairs
 
 STREET = Path(__file__).parents[2] / "samples/street"
 CONVENTIONS = {
@@ -51,6 +54,16 @@ def test_cameras_that_look_at_one_thing_tell_how_a_vehicle_that_stands_is_meant(
     found = opened(tmp_path, options, height=np.mean([each.ego_from_camera[2, 3] for each in truth.rig.cameras]))
     assert wrong(found, truth) == ""
     assert re.search(r"the images: two cameras see \d\d+ points at once; .*: \d\)", " ".join(found.notes))
+
+
+@pytest.mark.slow
+def test_a_few_points_decide_nothing(street, tmp_path, monkeypatch):
+    """At night, all that two cameras matched was one car."""
+    monkeypatch.setattr(judge, "camera_pairs", lambda *drive: [
+        replace(pair, rays_a=pair.rays_a[:3], rays_b=pair.rays_b[:3]) for pair in camera_pairs(*drive)])  # fmt: skip
+    options = write(street, tmp_path, Convention())
+    with pytest.raises(InputError, match="they show too little"):
+        opened(tmp_path, options)
 
 
 @pytest.mark.slow

@@ -49,6 +49,7 @@ CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
 SAME_HEIGHT_M, SAME_HEIGHT = 0.12, 0.08  # heights that differ less are the same: metres, and a share
 LOWEST_OF_GROUND_M = 1.2  # of the highest camera, if the origin is surely on the ground
 FEWEST_PAIRS, SURE_PAIRS = 2, 4  # of images, that decide; that refuse the only reading
+FEWEST_POINTS = 80  # matched in all of them; two cameras at night may see one car
 FRAMES_AT_ONCE = 2  # of a vehicle that stands, whose cameras see points together
 FEWEST_AT_ONCE, SHARE_AT_ONCE = 15, 0.25  # of these points in the reading that fits best; in others that may be meant
 MOST_RANK = 4  # of a rig and poses
@@ -156,6 +157,8 @@ class Judged:
         self._draft, self._poses, self._drive, self._options = draft, poses, drive, options
         self._times = np.array([stamp.timestamp_ns for stamp in drive.stamps], dtype=np.int64)
         self._pairs = list(camera_pairs(drive, self._frames())) if options.image_check else []
+        if sum(len(pair.rays_a) for pair in self._pairs) < FEWEST_POINTS:
+            self._pairs = []
         self._points = MatchedPoints(self._pairs) if self._pairs else None
         self._heights: dict[Candidate, float | None] = {}
 
