@@ -73,7 +73,7 @@ def shown_by_images(
     for index in looked_at:
         found += _overlaps_seen(drive.load(index), [placed[index].read_as(each.states) for each in readings])
     overlap = np.concatenate(found, axis=1)  # (R, D)
-    best, fits = overlap[overlap.sum(axis=1).argmax()], overlap.mean(axis=1)
+    best = overlap[overlap.sum(axis=1).argmax()]
     boxes_seen = min(len(best), sum(len(placed[index].boxes) for index in looked_at) / 2)
     if best.sum() < SOUND_OVERLAP * max(boxes_seen, 1):
         return list(readings)
@@ -84,6 +84,7 @@ def shown_by_images(
     others = [index for index in range(len(readings)) if index not in kept]
     if not others:
         return left
+    fits = overlap.mean(axis=1)
     nearest = max(others, key=lambda index: float(fits[index]))
     other, shown = readings[nearest], []
     for reading, fit in zip(left, fits[kept], strict=True):
