@@ -45,6 +45,7 @@ def test_the_images_tell_what_files_mean(name, street, tmp_path):
     assert "the images: " in " ".join(found.notes)
 
 
+@pytest.mark.slow
 def test_cameras_that_look_at_one_thing_tell_how_a_vehicle_that_stands_is_meant(tmp_path):
     """Direction and rotations: the question asks for the height only, which no image of one time tells."""
     truth = open_sequence(STREET, frames=slice(0, 1), ground_truth=False)

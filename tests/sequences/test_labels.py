@@ -290,6 +290,7 @@ def test_images_show_what_the_boxes_of_one_frame_do_not(street: Drive, tmp_path:
     np.testing.assert_allclose(found.load(0).ground_truth.to_numpy()[:, :7], truth.to_numpy()[:, :7], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_images_show_of_which_camera_kitti_labels_are(street: Drive, tmp_path: Path) -> None:
     few = DriveView(street, [0, 3])
     frames = tuple(FrameBoxes(few.stamps[place], few.load(place).world_from_ego, few.load(place).ground_truth)

@@ -94,18 +94,21 @@ def test_opposite_cameras_are_told_apart_on_a_straight_way():
     assert share(misfits([left], rows)) > 0.9 > 0.2 > share(misfits([stated(left, sides[1])], rows))
 
 
+@pytest.mark.slow
 def test_mirrored_images_are_named():
     points = Mistake("", "", "", {FRONT.name: FRONT}, mirrored=True).undone(seen(FRONT))
     (finding,) = findings(points, *SOUND)
     assert (finding.code, finding.camera) == ("images-mirrored", "CAM_FRONT")
 
 
+@pytest.mark.slow
 def test_images_of_the_frame_before_are_named_late():
     (finding,) = findings(seen(FRONT, shift=1), *SOUND)
     assert finding.code == "images-late"
     assert "500 ms too late" in finding.message
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_named_with_its_factor():
     longer = replace(FRONT, intrinsics=FRONT.intrinsics * [[1.15, 1, 1], [1, 1.15, 1], [1, 1, 1]])
     (finding,) = findings(stated(seen(FRONT), longer), *SOUND)
