@@ -30,8 +30,8 @@ def show(recording: Path, options: ViewOptions, name: Path | None = None) -> Non
         if options.summary or options.screenshot or options.video:
             _write_views(recording, file, options, name or recording)
         else:
-            if next(RecordingReader(file).frames(), None) is None:
-                say(f"note: {name or recording} has 0 frames of a run: another program wrote it, or it is damaged")
+            if not RecordingReader(file).is_of_a_run():
+                say(f"note: {name or recording} has no frames of a run: another program wrote it, or it is damaged")
             _open_viewer(file, options)
 
 

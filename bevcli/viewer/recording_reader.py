@@ -172,6 +172,15 @@ class RecordingReader:
                 else:
                     self.left_out += 1
 
+    def is_of_a_run(self) -> bool:
+        """True if it has a vehicle and boxes. What is behind their first rows is not read."""
+        wanted = set(OF_EACH_FRAME)
+        for chunk in self.chunks():
+            wanted.discard(chunk.entity_path.strip("/"))
+            if not wanted:
+                return True
+        return False
+
     def check_frame(self, index: int) -> None:
         """Raise InputError, which names the nearest frames, if the recording does not have a frame."""
         vehicle = (chunk for chunk in self.chunks() if chunk.entity_path.strip("/") == entities.EGO)

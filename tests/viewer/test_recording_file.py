@@ -120,7 +120,7 @@ def test_frames_whose_names_are_damaged_are_counted(recording, tmp_path, monkeyp
     viewing.show(damaged, ViewOptions(summary=True))
     assert "  frames    0 (3 without vehicle or boxes left out: is the file damaged?)\n" in capsys.readouterr().out
     viewing.show(damaged, ViewOptions())
-    assert "damaged.rrd has 0 frames of a run" in capsys.readouterr().out
+    assert "damaged.rrd has no frames of a run" in capsys.readouterr().out
     assert shown == [damaged]
     for write in (
         lambda: viewing.show(damaged, ViewOptions(video=tmp_path / "v.mp4")),
