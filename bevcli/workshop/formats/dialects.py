@@ -84,7 +84,7 @@ def with_intrinsics_by_name(entry: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _of_frames(document: Any, path: Path) -> Any:
     stamped = _stamped(document, path)
-    frames, own = stamped or _frames(document, path), []
+    frames = stamped or _frames(document, path)
     own = list(frames)
     beside = path.parent / ON_VEHICLE
     if stamped:

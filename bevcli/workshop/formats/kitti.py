@@ -57,7 +57,7 @@ def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labe
 
     They are in the frame of the camera `labels_camera`; by default of image_2, or of any camera: the images decide.
     """
-    cameras = sorted(rig.cameras, key=lambda camera: abs(camera.yaw))
+    cameras = _ahead_first(rig)
     name = options.labels_camera or next((name for name in LABELLED if name in rig.names), None)
     if name is not None and name not in rig.names:
         raise InputError(
@@ -69,8 +69,8 @@ def read_kitti_labels(path: Path, rig: CameraRig, options: LabelOptions) -> Labe
     return Labels(USUAL, frames, lists_empty=path.is_dir())
 
 
-def _looking_ahead(rig: CameraRig) -> str:
-    return min(rig.cameras, key=lambda camera: abs(camera.yaw)).name
+def _ahead_first(rig: CameraRig) -> list[Camera]:
+    return sorted(rig.cameras, key=lambda camera: abs(camera.yaw))
 
 
 def _labelled(index: int, rows: Sequence[LabelRow], cameras: Sequence[Camera]) -> LabelledFrame:
@@ -142,7 +142,7 @@ def export_kitti(boxes: BoxesFile, target: Path, options: ExportOptions, source:
     path = path / CALIBRATION if path.is_dir() else path
     rig, name = read_calibration(path), options.camera
     if name is None:
-        name = "CAM_FRONT" if "CAM_FRONT" in rig.names else _looking_ahead(rig)
+        name = "CAM_FRONT" if "CAM_FRONT" in rig.names else _ahead_first(rig)[0].name
     if name not in rig.names:
         raise InputError(f'{path}: has no camera "{name}" (expected one of {", ".join(rig.names)})')
     labels = write_kitti(boxes, rig[name], rig.ego_from_bev, target)

@@ -59,9 +59,8 @@ class LabelledFrame:
     index: int | None  # of the frame; None if the file has times only
     timestamp_ns: int | None  # of the frame; None if the file has indices only
     boxes: Boxes3D  # in the frame of reference of the file
-    by_camera: Mapping[str, Boxes3D] = field(
-        default_factory=dict
-    )  # the same, as those of each camera that they may be of
+    # the same, as those of each camera that they may be of
+    by_camera: Mapping[str, Boxes3D] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -270,9 +270,8 @@ def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
     for index, name in enumerate(names):
         plain = re.sub(r"\s*[\[(].*", "", name)  # without the unit
         quantity = next((quantity for quantity, pattern in NAMES.items() if re.fullmatch(pattern, plain)), None)
-        if (
-            quantity == "time" and quantity in places and name.endswith("stamp")
-        ):  # that of the message, as rostopic has it
+        # The time in a message, as rostopic has it, goes before that of its arrival.
+        if quantity == "time" and quantity in places and name.endswith("stamp"):
             del places[quantity]
         if quantity in places:
             both = f'"{names[places[quantity]]}" and "{name}"'

@@ -188,12 +188,9 @@ class PointsAtOnce:
 
     def __init__(self, drive: Drive, frames: Sequence[int]) -> None:
         cameras = [reduced(camera, min(WIDTH, camera.width)) for camera in drive.rig.cameras]
-        self._names, groups, rays, focals = (
-            list[tuple[str, str]](),
-            list[int](),
-            list[tuple[Array, Array]](),
-            list[float](),
-        )
+        self._names: list[tuple[str, str]] = []
+        rays: list[tuple[Array, Array]] = []
+        groups, focals = list[int](), list[float]()
         for index in frames:
             seen = _seen(drive, index, cameras)
             for first, second in combinations([camera for camera in cameras if camera.name in seen], 2):
