@@ -28,7 +28,9 @@ def convert(
     """
     from bevcli.workshop.formats.convert import Converted, to_convert, with_labels, write_drive
 
-    drive = with_labels(open_with_bar(input, to_convert(input, out, options), format_options), labels)
+    drive = with_labels(
+        open_with_bar(input, to_convert(input, out, options), format_options), labels, format_options.get("image_check")
+    )
     with Progress(len(drive.stamps), "frames", drive.notes) as progress:
         for step in write_drive(drive, out, written):
             if isinstance(step, Converted):

@@ -67,13 +67,15 @@ def convert(source: str | Path, out: str | Path, **options: Any) -> Converted:
     """
     common, labels, written, format_options = spread(options, InputOptions, LabelOptions, WriteOptions)
     drive = open_sequence(source, to_convert(Path(source), Path(out), common), **format_options)
-    converted: Converted = deque[Any](write_drive(with_labels(drive, labels), Path(out), written), maxlen=1).pop()
+    converted: Converted = deque[Any](
+        write_drive(with_labels(drive, labels, options.get("image_check")), Path(out), written), maxlen=1
+    ).pop()
     return converted
 
 
-def with_labels(drive: Drive, options: LabelOptions) -> Drive:
+def with_labels(drive: Drive, options: LabelOptions, image_check: bool | None) -> Drive:
     """The drive with the boxes of the file of labels, if one is given. Raises InputError as `WithLabels`."""
-    return drive if options.labels is None else WithLabels(drive, options.labels, options)
+    return drive if options.labels is None else WithLabels(drive, options.labels, options, image_check is not False)
 
 
 def to_convert(source: Path, out: Path, options: InputOptions) -> InputOptions:

@@ -69,15 +69,17 @@ class WithLabels(DerivedDrive):
     Labels belong to the frame of the same time, or, where the file has no times, of the same index. Where the file has
     tracks and no velocities, velocities follow from the positions before and after.
 
-    options: of the labels, whose file is `path`.
+    options: of the labels, whose file is `path`. image_check: the images decide what the boxes leave open.
 
     Raises InputError where the file cannot be read, or where not all of its frames are in the drive.
     """
 
-    def __init__(self, sequence: Drive, path: Path, options: LabelOptions = LabelOptions()) -> None:
+    def __init__(
+        self, sequence: Drive, path: Path, options: LabelOptions = LabelOptions(), image_check: bool = True
+    ) -> None:
         super().__init__(sequence)
         labels = read_labels(path, sequence.rig, options)
-        boxes, said = _in_world(sequence, labels, path, options)
+        boxes, said = _in_world(sequence, labels, path, options, image_check)
         boxes, note = _with_velocities(sequence, boxes)
         unlisted = "unlabelled" if labels.lists_empty else options.unlisted_frames
         labelled = _labelled_frames(sequence.stamps, boxes, unlisted)
@@ -127,7 +129,7 @@ def _labelled_frames(
 
 
 def _in_world(
-    sequence: Drive, labels: Labels, path: Path, options: LabelOptions
+    sequence: Drive, labels: Labels, path: Path, options: LabelOptions, image_check: bool
 ) -> tuple[dict[int, Boxes3D], tuple[str, ...]]:
     """The boxes in the world frame, by index of the frame in the drive; notes on how they are read."""
     times = np.array([stamp.timestamp_ns for stamp in sequence.stamps], dtype=np.int64)
@@ -154,7 +156,7 @@ def _in_world(
     left = fitting(path, frames, stated)
     of_cameras = [replace(left[0], states={**left[0].states, "labels_camera": name}) for name in labels.cameras]
     left = of_cameras[: None if any(len(each.boxes) for each in frames) else 1] or left
-    if len(left) > 1 or left[0].doubt:
+    if image_check and (len(left) > 1 or left[0].doubt):
         from bevcli.workshop.trust.witness import shown_by_images
 
         left = shown_by_images(sequence, placed, left)
