@@ -150,7 +150,7 @@ def _number(text: str) -> float:
     return value
 
 
-RigAngles: TypeAlias = Literal["wxyz", "xyzw", "vector", "radians", "degrees", "clockwise", "clockwise-radians"]
+RigAngle: TypeAlias = Literal["wxyz", "xyzw", "vector", "radians", "degrees", "clockwise", "clockwise-radians", "unity"]
 PoseAngles: TypeAlias = Literal[
     "degrees", "radians", "compass", "compass-radians", "clockwise", "clockwise-radians", "vector", "wxyz", "xyzw"
 ]
@@ -187,10 +187,11 @@ class RigOptions:
         help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
         "up, z backward (opengl) or forward (unity); x forward, y right, z up (unreal) or down (ned).",
     )
-    rig_angles: RigAngles | None = option(
+    rig_angles: RigAngle | None = option(
         default=None,
-        help="What the numbers of a rotation in --calibration are: a quaternion, a rotation vector, or roll, pitch and "
-        "yaw, also clockwise.",
+        help="Rotation in --calibration: a quaternion (wxyz, xyzw), a rotation vector (vector), or roll, pitch and yaw "
+        "(radians, degrees, clockwise, clockwise-radians, or unity: about z, x and y). Default: what the images show.",
+        metavar="ANGLES",
     )
     rig_unit: Literal["m", "cm", "mm", "in", "ft"] | None = option(
         default=None, help="Unit of the translations in --calibration. Default: the one that gives a vehicle."

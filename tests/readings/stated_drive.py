@@ -93,7 +93,8 @@ def _pose(ego_from_camera: np.ndarray, convention: Convention) -> dict[str, obje
         return {"rotation": np.roll(rotation.as_quat(), 1).tolist(), "translation": translation}
     if convention.rotation == "vector":
         return {"rotation": rotation.as_rotvec().tolist(), "translation": translation}
-    angles = dict(zip(("yaw", "pitch", "roll"), rotation.as_euler("ZYX", degrees=True).tolist(), strict=True))
+    order = "YXZ" if convention.rotation == "unity" else "ZYX"
+    angles = dict(zip(("yaw", "pitch", "roll"), rotation.as_euler(order, degrees=True).tolist(), strict=True))
     return angles | dict(zip("xyz", translation, strict=True))
 
 

@@ -23,6 +23,7 @@ CONVENTIONS = {
     "centimetres above an IMU": Convention(unit="cm", origin_m=0.55, rotation="rpy"),
     "KITTI's rows of a vehicle": Convention(file="kitti", rotation="vector", transform="T"),
     "Unity": Convention(rig_axes="ruf", camera_axes="unity"),
+    "LGSVL": Convention(rig_axes="ruf", camera_axes="unity", rotation="unity"),
     "cameras of OpenGL": Convention(camera_axes="opengl", body="frd", unit="mm"),
 }
 

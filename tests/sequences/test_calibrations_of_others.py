@@ -2,7 +2,9 @@
 
 import json
 import pickle
+import re
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -458,7 +460,7 @@ def test_a_lens_has_the_names_of_ros_kalibr_and_opencv(tmp_path, alias, model):
         (KALIBR.replace("T_cn_cnm1", "T_other"), {"cam0": POSE}, "camera cam1: its pose .* is missing"),
         (KALIBR, {"cam0": {**POSE, "rotation_wxyz": [1, 1, 0, 0]}}, "cam0.*norm"),
         ("a: [", {}, "broken YAML"),
-        ("a: 1", {}, "expected .* a Kalibr camchain"),
+        ("a: 1", {}, "has no camera .expected K, D and T of each camera by name, such as"),
         ("!!python/object/apply:os.getcwd []", {}, "YAML"),
     ],
 )
@@ -472,3 +474,14 @@ def test_mistakes_name_file_and_camera(tmp_path, text, poses, expected):
     with pytest.raises(InputError, match="must be given together"):
         read_rig(None, extrinsics)
     assert draft_of(RigOptions()) is None
+
+
+def test_the_example_in_a_refusal_is_read(tmp_path):
+    """AirSim's settings are refused with a table to write instead."""
+    with pytest.raises(InputError) as refused:
+        read(written(tmp_path, '{"SimMode": "Car", "Vehicles": {}}', "settings.json"), None)
+    path = written(tmp_path, re.search("such as (.*); others", str(refused.value))[1], "rig.json")
+    (tmp_path / "drive/images/front").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "drive/images/front/0.png"), np.zeros((600, 800), np.uint8))
+    rig = read(path, tmp_path / "drive").rig
+    assert rig["front"].ego_from_camera[:3, 3].tolist() == [1.5, 0, 1.6]

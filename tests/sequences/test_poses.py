@@ -289,6 +289,8 @@ def test_times_with_two_readings_are_asked_for(tmp_path):
         (lines(S, X, Y, ZERO, *LEVEL, QZ, QW + 0.01), "quaternion's norm is .*expected 1"),
         (lines(S, *LEVEL, separator=",", header="t,x,y"), "columns of the orientation are missing"),
         (lines(X[1:], Y[1:], YAW[1:], separator=",", header="x,y,yaw"), "a column of times is missing"),
+        ("VERTEX_SE3:QUAT 0 1 2 0 0 0 0 1", "is a graph of g2o, which has no times: write its poses as CSV with"),
+        ("\x93NUMPY\x01\0", "is no text: write its poses as CSV with the columns timestamp,x,y,z,qw,qx,qy,qz"),
         ('{"poses": [{"t": 1, "x": 2', "broken JSON"),
         ("[" * 100_000, "nested too deeply"),
         ('[{"t": 1, "x": 0, "y": 0}, {"t": 2, "x": 0}]', "pose 1 has other fields than the first one"),

@@ -20,6 +20,7 @@ CAMERA_AXES = {"optical": "rdf", "vehicle": "flu", "opengl": "rub", "unity": "ru
 ORDERS = {order: f"quaternion {' '.join(order)}" for order in ("wxyz", "xyzw")}
 ANGLES = {"vector": "rotation vectors"} | {unit: f"roll, pitch and yaw in {unit}" for unit in ("radians", "degrees")}
 ANGLES |= {"clockwise": f"{ANGLES['degrees']}, clockwise", "clockwise-radians": f"{ANGLES['radians']}, clockwise"}
+ANGLES |= {"unity": "yaw, pitch and roll in degrees about y, x and z"}
 POSE_ANGLES = {unit: f"yaw in {unit} counter-clockwise from x" for unit in ("radians", "degrees")} | {
     "compass": "heading in degrees clockwise from north", "compass-radians": "heading in radians clockwise from north",
     "clockwise": "yaw in degrees clockwise from x", "clockwise-radians": "yaw in radians clockwise from x",

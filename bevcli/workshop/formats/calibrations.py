@@ -161,7 +161,8 @@ def _fields(name: str, of: StatedCamera, ego_from_camera: Array, path: Path, dri
     """The fields of a camera, as in calibration.json."""
     if of.intrinsics is None:
         raise InputError(
-            f"{path}: camera {name}: has no intrinsics (expected K, camera_matrix, intrinsics or fx, fy, cx, cy)"
+            f"{path}: camera {name}: has no intrinsics (expected K, camera_matrix, intrinsics or fx, fy, cx, cy; "
+            "from a horizontal field of view, fx and fy are width / 2 / tan(fov / 2))"
         )
     size = of.size or size_of_first(drive, name)
     if size is None:

@@ -191,10 +191,12 @@ def _states(free: Sequence[StatedPose], stated: Mapping[str, str]) -> Iterator[t
     ]
     for axes, values in product(pairs, product(*choices.values())):
         states = dict(zip(choices, values, strict=True))
+        if states["rig_angles"] == "unity" and axes != ("ruf", "unity"):
+            continue
         is_usual = (
             axes[0] in (*USUAL_AXES, stated.get("rig_axes"))
             and axes[1] in (*USUAL_CAMERAS, known["camera_axes"])
-            and (not states["rig_angles"].startswith("clockwise") or "rig_angles" in stated)
+            and (not states["rig_angles"].startswith(("clockwise", "unity")) or "rig_angles" in stated)
             and states["rig_unit"] in (*USUAL_UNITS, stated.get("rig_unit"))
         )
         yield {"transform": states["transform"], **dict(zip(PAIR, axes, strict=True)), **states}, int(not is_usual)

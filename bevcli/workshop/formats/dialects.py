@@ -86,11 +86,11 @@ def _of_frames(document: Any, path: Path) -> Any:
     stamped = _stamped(document, path)
     frames = stamped or _frames(document, path)
     own = list(frames)
-    beside = path.parent / ON_VEHICLE
-    if stamped:
+    beside, is_whole = path.parent / ON_VEHICLE, all(_from_root(frames, frame)[0] == VEHICLE for frame in own)
+    if stamped and not is_whole:
         files = [file for file in path.parent.glob("*.yaml") if file != path]
         frames = {name: at for file in files for name, at in _stamped(read_yaml(file), file).items()} | frames
-    elif frames and VEHICLE not in (parent for parent, _ in frames.values()) and is_there(beside):
+    elif not is_whole and is_there(beside):
         frames |= _frames(read_yaml(beside), beside)
     cameras: dict[str, dict[str, Any]] = {}
     for frame in sorted(own, key=lambda name: "optical" in name):  # the frame of the image replaces that of the body

@@ -32,7 +32,7 @@ from bevcli.workshop.formats.label_readings import LARGEST_RADIANS, USUAL, Label
 from bevcli.workshop.formats.name_times import read_times
 from bevcli.workshop.formats.other_calibrations import lines_of
 from bevcli.workshop.formats.pose_readings import product, quaternions_of_angles, rotated
-from bevcli.workshop.formats.pose_table import number_of
+from bevcli.workshop.formats.pose_table import AS_TEXT, number_of
 from bevcli.writing import write_whole
 
 KITTI_FILES = ("calib_cam_to_cam.txt", "calib.txt", "perspective.txt")  # the last one of KITTI-360
@@ -361,7 +361,8 @@ def read_oxts(folder: Path) -> ReadPoses:
     """
     if not (folder / "data").is_dir():
         raise InputError(
-            f"{folder}: is no folder of poses (expected data and timestamps.txt of KITTI's oxts): pass a file"
+            f"{folder}: is no folder of poses (expected data and timestamps.txt of KITTI's oxts): pass a file, such as "
+            f"{AS_TEXT}"
         )
     files = sorted((folder / "data").glob("*.txt"))
     times = read_times(folder / "timestamps.txt")

@@ -57,6 +57,7 @@ ROTATION = ("rotation", "r", "rotationmatrix", "rotationwxyz", "rotationxyzw", "
 UNIT = re.compile("(deg|rad)(rees|ians)?$")  # ends the name of an angle
 ANGLES = ("roll", "pitch", "yaw")
 TRANSLATION = ("translation", "t", "position", "tvec", "location", "xyz")
+YXZ_FROM_ZYX = np.eye(3)[[1, 2, 0]]  # axes of yaw, pitch and roll: Unity's y, x and z in place of z, y and x
 LARGEST_RADIANS = 6.5  # a little more than a turn; larger angles are degrees
 CAMERA_FRAMES = r"camera\d*|cam\d*|sensor|c"
 FIRST_CAMERAS = ("cam0", "camera0", "c0")
@@ -67,6 +68,10 @@ COEFFICIENTS = {
     "brown_conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 PINHOLES = ("pinhole", "none", "perspective")
+EXAMPLE = (
+    '{"cameras": {"front": {"fx": 700, "fy": 700, "cx": 400, "cy": 300, "x": 1.5, "y": 0, "z": 1.6, "roll": 0, '
+    '"pitch": 0, "yaw": 0}}}'
+)
 NO_TRANSFORM = "is not understood as a transform (expected 4x4 or 3x4 numbers, or a rotation and a translation)"
 
 
@@ -131,7 +136,7 @@ def _from_xml(element: Element, path: Path) -> Any:
 def cameras_of(document: Any, path: Path) -> Cameras:
     """The cameras of a document with their K, D and T by name. Raises InputError, which names `path`."""
     document = with_own_names(document, path)
-    expected = "a calibration with K, D and T of each camera, a Kalibr camchain or a ROS camera_info"
+    expected = f"K, D and T of each camera by name, such as {EXAMPLE}; others: docs/other-inputs.md#calibrations"
     if not document and document is not None:  # frames of other sensors
         return {}
     if isinstance(document, list):
@@ -335,7 +340,7 @@ def _matrices(value: Any) -> dict[str, Array]:
         if rotation is None or translation is None:
             return {}
         rotations = _rotations(*rotation)
-        kinds = [kind for kind in rotations if units and any(unit in kind or kind == "clockwise" for unit in units)]
+        kinds = [kind for kind in rotations if units and kind != "vector" and ("rad" in kind) == ("rad" in units)]
         return {kind: rigid(translation.ravel(), rotations[kind]) for kind in kinds or rotations}
     array = _numbers(value)
     if array is None or array.size not in (12, 16):
@@ -399,4 +404,5 @@ def _rotations_of_three(name: str, numbers: Array) -> dict[str, Array]:
         for unit, angles in kinds:
             if largest <= LARGEST_RADIANS or "radians" not in unit:
                 rotations[unit] = rotation_from_quaternion(quaternions_of_angles(*angles[:, None])[0])
+        rotations["unity"] = YXZ_FROM_ZYX @ rotations["degrees"] @ YXZ_FROM_ZYX.T
     return rotations

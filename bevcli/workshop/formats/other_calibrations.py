@@ -188,6 +188,8 @@ def read_nerfstudio(path: Path) -> Cameras | None:
 
 
 def _nerf_camera(entry: Mapping[str, Any], where: str) -> StatedCamera:
+    if "fl_x" not in entry and "camera_angle_x" in entry:
+        raise InputError(f'{where}: "fl_x" is missing: add w / 2 / tan(camera_angle_x / 2), and w, h, cx and cy')
     fx, cx, cy = (require(parse_numbers, {key: [entry[key]] if key in entry else None}, key, (1,), where=where)[0]
                   for key in ("fl_x", "cx", "cy"))  # fmt: skip
     matrix = [[fx, 0, cx - PIXEL_CENTER], [0, entry.get("fl_y", fx), cy - PIXEL_CENTER], [0, 0, 1]]

@@ -92,6 +92,8 @@ GOPRO = {
     "fix": "fix",
 }  # fmt: skip
 NMEA = re.compile(r"\$(?:G[A-Z])(GGA|RMC),")
+G2O = (b"VERTEX_", b"EDGE_", b"FIX ")  # begin its lines
+AS_TEXT = "CSV with the columns timestamp,x,y,z,qw,qx,qy,qz"
 XML = (b"<?xml", b"<gpx", b"<kml ")
 
 
@@ -283,8 +285,12 @@ def _columns(path: Path, names: Sequence[str]) -> dict[str, int]:
 
 def table_text(path: Path) -> str:
     """The text of a table of poses; of a file of another kind, a table of what it states. Raises InputError."""
-    if read_bytes(path, CSV_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() in XML:
+    content = read_bytes(path, CSV_BYTES)
+    if content.removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() in XML:
         return "\n".join(_of_track(path))
+    if b"\0" in content[:BLOCK] or content.lstrip().startswith(G2O):
+        what = "is no text" if b"\0" in content[:BLOCK] else "is a graph of g2o, which has no times"
+        raise InputError(f"{path}: {what}: write its poses as {AS_TEXT}")
     text = read_text(path, CSV_BYTES).removeprefix("\ufeff")
     first = text.lstrip().partition("\n")[0].strip()
     if first.startswith(("[", "{")):
