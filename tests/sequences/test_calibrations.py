@@ -454,6 +454,7 @@ def test_a_mistake_is_one_line_that_names_file_and_camera(tmp_path, mistake):
     [
         ({"fov_deg": 70}, "needs the height"),
         ({"height": 1.5}, "needs a field of view or a calibration"),
+        ({"rig_axes": "frd"}, "`rig_axes` .`--rig-axes`. needs a field of view"),
         ({"fov_deg": 70, "height": 1.5}, "directions of 6 cameras are not stated"),
         ({"fov_deg": 70, "height": 1.5, "yaw_deg": 0}, "one direction for 6 cameras"),
         ({"fov_deg": 70, "height": 1.5, "yaw_deg": {"front": 0}}, "there is no camera front"),

@@ -33,7 +33,7 @@ from bevcli.errors import InputError
 from bevcli.frame import CameraImage, Drive, Frame
 from bevcli.geometry.cameras import Distortion
 from bevcli.geometry.ego_motion import EgoMotion
-from bevcli.geometry.transforms import Pose, rotation_about_z
+from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.sequences.files.ego_motion_file import read_ego_motion
 from bevcli.sequences.open import open_sequence
 
@@ -374,21 +374,29 @@ def test_frames_before_the_first_pose_are_left_out(tmp_path, native, motion):
     assert any("1 of 4 frames are left out" in note for note in sequence.notes)
 
 
-def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path, native, motion):
-    base_from_imu = Pose.from_matrix(np.eye(4))
-    base_from_imu = replace(base_from_imu, translation=np.array([1.0, 2.0, 3.0]))
+@pytest.mark.parametrize("body", ["imu", "CAM_FRONT_optical"])
+def test_poses_of_another_part_of_the_vehicle_move_to_the_ego(tmp_path, native, motion, body):
+    bodies = {"imu": rigid((1, 2, 3)), "CAM_FRONT_optical": native.rig["CAM_FRONT"].ego_from_camera}
+    base_from_body = Pose.from_matrix(bodies[body])
     messages = [m for m in messages_of(native, None) if m[0] != "/odom"]
     messages.append(("/tf_static", "tf2_msgs/TFMessage", 10**9, {"transforms": [
-        transform(10**9, "base_link", "imu", base_from_imu)
+        transform(10**9, "base_link", body, base_from_body)
     ]}))  # fmt: skip
     for time in motion.timestamps_ns.tolist():
         pose = motion.pose_at(time)
-        world_from_imu = Pose.from_matrix(pose.matrix @ base_from_imu.matrix)
-        messages.append(("/odom", "nav_msgs/Odometry", time, odometry(time, "map", "imu", world_from_imu)))
+        world_from_body = Pose.from_matrix(pose.matrix @ base_from_body.matrix)
+        messages.append(("/odom", "nav_msgs/Odometry", time, odometry(time, "map", body, world_from_body)))
     topics = tmp_path / "topics.toml"
     topics.write_text('ego_frame = "base_link"\n')
-    sequence = open_sequence(write_mcap(tmp_path / "bag.mcap", messages), topics_file=topics)
-    assert_posed(sequence.load(2), native.load(2))
+    path = write_mcap(tmp_path / "bag.mcap", messages)
+    for stated in ({}, {"topics_file": topics}):
+        assert_posed(open_sequence(path, **stated).load(2), native.load(2))
+
+
+def test_options_do_not_state_the_poses_of_a_bag(tmp_path, native, motion):
+    path = write_mcap(tmp_path / "bag.mcap", messages_of(native, motion))
+    with pytest.raises(InputError, match=r"pass `pose_axes` .`--pose-axes`. with the sequence folder"):
+        open_sequence(path, pose_axes="frd")
 
 
 def test_a_chain_of_moving_transforms_is_multiplied(tmp_path, native, motion):

@@ -63,7 +63,7 @@ def read_rig(
     """
     if calibration is None:
         if fov_deg is None:
-            raise InputError(_incomplete(extrinsics, height))
+            raise InputError(_incomplete(extrinsics, next(iter(stated), "yaw_deg" if height is None else "height")))
         return _guessed_rig(drive, fov_deg, height, yaw_deg)
     if fov_deg is not None:
         raise InputError("`calibration` (`--calibration`) and `fov_deg` (`--fov`) exclude each other: pass one of them")
@@ -105,16 +105,15 @@ def _rig(
     return CameraRig(cameras, bev, ego_from_bev is None), [finding]
 
 
-def _incomplete(extrinsics: Path | None, height: ByCamera) -> str:
+def _incomplete(extrinsics: Path | None, option: str) -> str:
     if extrinsics is not None:
         return (
             "`intrinsics` (`--intrinsics`) and `extrinsics` (`--extrinsics`) must be given together: pass both, or "
             "pass `calibration` (`--calibration`)"
         )
-    name = "`yaw_deg` (`--yaw`)" if height is None else "`height` (`--height`)"
     return (
-        f"{name} needs a field of view or a calibration: pass `fov_deg=70` (`--fov 70`) or `calibration` "
-        "(`--calibration FILE`)"
+        f"{named(RigOptions, option)} needs a field of view or a calibration: pass `fov_deg=70` (`--fov 70`) or "
+        "`calibration` (`--calibration FILE`)"
     )
 
 

@@ -22,6 +22,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import TOLERANCE_NS, EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import EAST_DEG, Array, GeoOrigin, quaternion_from_rotation
+from bevcli.options import named
 from bevcli.parsing.documents import LARGEST_INTEGER, CsvRow
 from bevcli.parsing.files import is_there
 from bevcli.printing import counted
@@ -61,6 +62,7 @@ PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least 
 UNIT_ROWS = 50_000  # at the start, and the last one, whose times tell the unit
 _DIGITS = re.compile(r"\d{1,18}(?:\.\d{0,18})?", re.ASCII)  # a time with all of its digits
 POSE_STATEMENTS = ("poses_of", "pose_axes", "pose_transform", "pose_angles", "pose_unit")
+FOLDER = "the sequence folder (`bevcli convert` writes one)"  # whose poses the options may state
 ANGLES = ("vector", "radians", "degrees", "compass", "compass-radians", "clockwise", "clockwise-radians")
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # those of feet are stated
 LARGEST_NUMBER = 10**7  # of a frame
@@ -73,6 +75,7 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     Raises InputError for a file that lacks something, or that can be read in two ways.
     """
     if path.is_dir():
+        refuse_statements(path, drive.stated)
         return read_oxts(path)
     table = read_table(path)
     name = "" if table is None else _kind(table)
@@ -109,6 +112,12 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
     readings = [replace(each, note=f"poses: {first}, {each.words()}{last}") for each in readings]
     read = of_reading(readings[0], times, drive.rig)
     return replace(read, geo_origin=origin, readings=tuple(readings), others=others, file=path)
+
+
+def refuse_statements(path: Path, stated: RigOptions) -> None:
+    """Raise InputError where options state what poses are that are certain."""
+    for name in (name for name in (*POSE_STATEMENTS, "pose_times") if getattr(stated, name) is not None):
+        raise InputError(f"{path}: states what its poses are: pass {named(RigOptions, name)} with {FOLDER}, or none")
 
 
 def _kind(table: Table) -> str:

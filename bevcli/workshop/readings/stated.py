@@ -14,7 +14,7 @@ from bevcli.sequences.files.ego_motion_file import ReadPoses
 from bevcli.sequences.files.readings import PoseReading, differing
 from bevcli.sequences.options import RigOptions
 from bevcli.workshop.formats.pose_readings import of_bodies, rotated
-from bevcli.workshop.formats.poses import of_reading
+from bevcli.workshop.formats.poses import FOLDER, of_reading
 from bevcli.workshop.readings.judge import AROUND_NS, Judged
 
 DEGREES = 180 / np.pi
@@ -46,7 +46,11 @@ def fitting_poses(drive: Drive, stated: EgoMotion) -> tuple[Finding, EgoMotion] 
     assert fitting.poses is not None
     names = differing([as_it_is, fitting.poses])
     code, message, expected, columns = MISTAKES[next(name for name in MISTAKES if name in names)]
-    advice = f"correct the {columns}" if columns else f"pass `{fitting.poses.flags(names)}`, or transform the poses"
+    advice = (
+        f"correct the {columns}"
+        if columns
+        else f"pass `{fitting.poses.flags(names)}` with {FOLDER}, or transform the poses"
+    )
     described = f"{fitting.poses.words(names)}: {fitting.residual_px:.1f} px in the images, as stated {residual_px}"
     motion = of_reading(fitting.poses, stated.timestamps_ns, drive.rig).motion
     assert motion is not None

@@ -31,6 +31,7 @@ from bevcli.sequences.native.folder import decided
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import BagOptions, is_packed_bag, is_ros_bag
 from bevcli.workshop.formats.matching import CameraImages, frames_at
+from bevcli.workshop.formats.poses import refuse_statements
 from bevcli.workshop.formats.ros.bag import Bag, CameraTopics, TopicFinder, read_topics_file
 from bevcli.workshop.formats.ros.messages import payload, timestamp_ns
 from bevcli.workshop.formats.ros.vehicle import VehicleReader, capture_times, find_geo_origin
@@ -235,6 +236,7 @@ def open_bag(path: Path, common: InputOptions, options: BagOptions) -> images.Li
     if file is not None and common.ego_motion != "static":
         poses = read_poses(file, DrivePoses(used_rig, options, frame_times, bool(draft.readings)))
     else:
+        refuse_statements(path, options)
         motion, source, motion_notes = reader.motion(common.ego_motion)
         poses = ReadPoses(motion, motion_notes)
     entries, gaps = _covered(entries, poses.motion, path)

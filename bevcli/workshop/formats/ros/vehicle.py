@@ -262,11 +262,15 @@ class VehicleReader:
         return self._bag.first(topics.calibration, parse, "a calibration")
 
     def _find_ego_frame(self, camera_frames: list[str]) -> str:
-        """The frame of the vehicle: the one that a pose topic names, a usual name, or the root of all cameras."""
+        """The frame of the vehicle: a usual name above the one that a pose topic names, or else this one.
+
+        Where it is the frame of a camera, or none is named, it is a usual name, or the root of all cameras.
+        """
         above = [self._tree.up(frame) for frame in camera_frames]
         pose = self._finder.pose_topic()
         named = self._child_of(pose) if pose else ""
-        for name in (named, *EGO_FRAMES):
+        usual = [name for name in self._tree.up(named) if name in EGO_FRAMES]
+        for name in (*usual, "" if named in camera_frames else named, *EGO_FRAMES):
             if name and name in self._tree.frames:
                 return name
         common = [frame for frame in above[0] if all(frame in path for path in above)]
