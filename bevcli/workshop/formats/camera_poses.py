@@ -46,6 +46,7 @@ PAIR = "rig_axes", "camera_axes"
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
 AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
 AXES_FROM_OPTICAL = {name: inverse(rigid(rotation=rotation)) for name, rotation in AXES.items()}  # (4, 4)
+EGO_FROM_BODY = {letters: rigid(rotation=ego_from_axes(letters)) for letters in ALL_AXES}  # (4, 4)
 # Axes of the vehicle and of the cameras: usual ones, and others, both right-handed or both left-handed.
 USUAL_CAMERAS = "optical", "vehicle"
 USUAL = tuple(product(USUAL_AXES, USUAL_CAMERAS))
@@ -88,8 +89,7 @@ class StatedPose:
             with np.errstate(invalid="ignore"):  # infinity is refused where the camera is made
                 return (matrix if self.direction == "ego_from_camera" else inverse(matrix)) @ then
         body_from_axes = matrix if states["transform"] == "ego_from_camera" else inverse(matrix)
-        ego_from_body = rigid(rotation=ego_from_axes(states["rig_axes"]))
-        return ego_from_body @ body_from_axes @ AXES_FROM_OPTICAL[states["camera_axes"]] @ then
+        return EGO_FROM_BODY[states["rig_axes"]] @ body_from_axes @ AXES_FROM_OPTICAL[states["camera_axes"]] @ then
 
     @property
     def any_matrix(self) -> Array:
@@ -99,7 +99,9 @@ class StatedPose:
 
 def in_metres(matrix: Array, states: Mapping[str, str]) -> Array:
     """A transform (4, 4) whose translation is in the unit that a reading states."""
-    return rigid(UNITS_M[states["rig_unit"]] * matrix[:3, 3], matrix[:3, :3])
+    scaled = matrix.copy()
+    scaled[:3, 3] *= UNITS_M[states["rig_unit"]]
+    return scaled
 
 
 @dataclass(frozen=True)
