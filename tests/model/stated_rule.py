@@ -7,6 +7,7 @@ seeded by the CRC-32 of its official key, and its scale depends on the kind of t
 import math
 import re
 import zlib
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ def rule_tensor(key: str, shape: tuple[int, ...], stem_gain: float) -> np.ndarra
     return (gain * draw / root).astype(np.float32)
 
 
+@cache
 def rule_image(frame: int, camera: str, height: int = 900, width: int = 1600) -> NDArray[np.uint8]:
     """(H, W, 3) BGR: blocks of 100 pixels, blocks of 25 pixels and noise."""
     random = stream(f"image/{frame}/{camera}")

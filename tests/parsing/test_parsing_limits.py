@@ -34,7 +34,7 @@ def refused(function, *arguments, error=InputError, **options):
     return str(caught.value)
 
 
-@pytest.mark.parametrize("levels", [65, 1000, 100_000, 1_000_000])
+@pytest.mark.parametrize("levels", [65, 1000, 100_000])
 @pytest.mark.parametrize(("start", "end"), [(b"[", b"]"), (b'{"a":', b"}")])
 def test_deep_json_is_refused(levels, start, end):
     text = start * levels + b"1" + end * levels
