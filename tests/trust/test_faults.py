@@ -122,6 +122,7 @@ def test_mirrored_poses_are_one_finding():
     assert [each.code for each in findings(*SOUND, rows=rows)] == ["motion-axes"]
 
 
+@pytest.mark.slow
 def test_a_wrong_rotation_is_named_with_its_angle():
     turn = Rotation.from_rotvec(np.radians([2, 1.5, 0])).as_matrix()  # the stated camera looks up and right
     camera = replace(FRONT, ego_from_camera=FRONT.ego_from_camera @ rigid(rotation=turn))
