@@ -144,7 +144,7 @@ def test_two_processes_may_make_a_file_at_the_same_time(steps, small_file):
         with file.written() as path:
             shutil.copy(small_file, path)
             both.wait()
-        return file.opened(OnnxRuntimeEngine, "drive").calibrated_with
+        return file.opened(OnnxRuntimeEngine, "drive")[1]
 
     file = CachedFile("same")
     with ThreadPoolExecutor(2) as pool:
