@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from bevcli.errors import Finding, InputError
@@ -37,12 +38,12 @@ CLEAR, CLEAR_PX = 2.0, 0.2  # factor and addition, by which the residuals of all
 EXACT, EXACT_PX = 1.5, 0.1  # the same where images and rig are exact (`FLOOR_PX`)
 NEAR, NEAR_PX = 1.25, 0.05  # the same, of readings of which the usual one is believed
 FLOOR_PX = 0.3  # no other reading is clearly better than one with this
-UNFIT_PX = 5.0  # residual of a reading that is not believed though it is the only one
+UNFIT_PX = 5.0  # residual of a reading that is not believed though no other is better
 LOWEST_M = -0.2  # mean height of usual cameras above the origin, which may be at a roof
 SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that differ less are the same
 CONTRADICTING = 3.0  # the same factor, of what is stated
 LEAST_OFF_PX, OFF = 0.4, 2.2  # residual of poses that may be late or of another point; how much smaller it is without
-LATE_NS = (50_000_000, 100_000_000, 200_000_000, 400_000_000)
+LATE_NS, LATEST_NS = 50_000_000, 500_000_000  # step in which the times of the poses are tried, and the largest
 TRIED_POINTS, FARTHEST_POINT_M = 80, 4.0  # of the vehicle, that the poses may be of
 OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those of a rig that is certain
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
@@ -252,21 +253,18 @@ class Judged:
                 return left[0], evidence
         if len(left) > 1 and not unsound:
             left = [each for each in left if self._missing_height(each) == 0] or left
-        if len(left) > 1:
-            return self._on_both_sides(left)
         is_stated = bool(self._draft.others or self._poses.others)
-        if (
-            unsound
-            and len(self._pairs) >= FEWEST_PAIRS
-            and not is_stated
-            and (best.rank or (best.residual_px > UNFIT_PX and len(self._pairs) >= SURE_PAIRS))
-        ):
+        is_unfit = best.residual_px > UNFIT_PX and len(self._pairs) >= SURE_PAIRS and not is_stated
+        wrong = "" if is_stated else self._other_fit(left[0], found)
+        if len(left) > 1 and not is_unfit and not wrong:
+            return self._on_both_sides(left)
+        if not wrong and (is_unfit or (unsound and best.rank and len(self._pairs) >= FEWEST_PAIRS and not is_stated)):
             raise InputError(
-                f"{self._files(BOTH)}: the images do not fit the only reading, {best.whole.words()} (residual "
+                f"{self._files(BOTH)}: the images fit no reading; best, {best.whole.words()} (residual "
                 f"{best.residual_px:.1f} px): correct the file, pass `odometry=True` (`--odometry`) in place of the "
                 "poses, or `image_check=False` (`--no-image-check`) to read it so"
             )
-        if wrong := self._misstated(left[0], is_stated):
+        if wrong := wrong or self._other_scale(left[0]):
             raise InputError(
                 f"{self._files(BOTH)}: {wrong}; correct the poses, pass `odometry=True` (`--odometry`) in place of "
                 "them, or `image_check=False` (`--no-image-check`) to read them so"
@@ -323,20 +321,23 @@ class Judged:
             f"({fitting.residual_px:.1f} px)"
         )
 
-    def _misstated(self, chosen: Candidate, is_stated: bool) -> str:
-        """Why poses of another program are not believed as they are read: how they would fit much better; "" if so.
+    def _other_fit(self, chosen: Candidate, found: Sequence[Candidate]) -> str:
+        """How poses that are late, or of another point, would fit much better than as they are read; "" if not so.
 
-        is_stated: the user says what they are, but for their scale.
+        An unusual rig is not believed where a usual one would fit as well so. found: all readings.
         """
         if chosen.poses is None or len(self._pairs) < FEWEST_PAIRS:
             return ""
-        if text := self._other_scale(chosen):
+        usual = next((each for each in found if each.rank < chosen.rank and each.poses is chosen.poses), None)
+        if usual and (text := self._late_or_elsewhere(usual, min(chosen.residual_px, LEAST_OFF_PX))):
             return text
-        return "" if is_stated or chosen.residual_px <= LEAST_OFF_PX else self._late_or_elsewhere(chosen, chosen.poses)
+        return "" if chosen.residual_px <= LEAST_OFF_PX else self._late_or_elsewhere(chosen, LEAST_OFF_PX)
 
     def _other_scale(self, chosen: Candidate) -> str:
         """The share of the ways that the poses state, by the height of the cameras above the road; "" if it is all."""
-        seen_m = self._height_seen(chosen) if self._options.pose_unit is None else None
+        if chosen.poses is None or len(self._pairs) < FEWEST_PAIRS or self._options.pose_unit is not None:
+            return ""
+        seen_m = self._height_seen(chosen)
         if seen_m is None:
             return ""
         height = self._options.height
@@ -348,21 +349,25 @@ class Judged:
             return ""
         return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
 
-    def _late_or_elsewhere(self, chosen: Candidate, reading: PoseReading) -> str:
-        """What the poses are with which the images fit much better: late, or of another point; "" if nothing."""
-        assert self._points is not None
-        points, track = self._points, _tracks(replace(self._poses, readings=(reading,)), self._times)[0]
+    def _late_or_elsewhere(self, chosen: Candidate, most_px: float) -> str:
+        """What the poses are with which the images fit much better: late, or of another point; "" if nothing.
+
+        most_px: the largest residual of what fits.
+        """
+        points, reading = self._points, chosen.poses
+        assert points is not None
+        assert reading is not None
+        track = _tracks(replace(self._poses, readings=(reading,)), self._times)[0]
         at = np.array([pair.times_ns for pair in self._pairs], dtype=np.int64)
         body = self._cameras(chosen.rig)[reading.camera] if reading.camera else np.eye(4)
 
-        def residual_px(place: Array, late_ns: int = 0) -> float:
-            steps = place @ body_motions(track.at(at - late_ns)[0]) @ inverse(place)
+        def residual_px(place: Array, late_ns: float = 0) -> float:
+            steps = place @ body_motions(track.at(at - round(late_ns))[0]) @ inverse(place)
             return points.residual_px(chosen.cameras, steps)
 
-        changes = [
-            (residual_px(body, sign * late_ns), f"{late_ns // 10**6} ms {word}")
-            for late_ns, (sign, word) in product(LATE_NS, ((1, "later"), (-1, "earlier")))
-        ]
+        near = min(range(-LATEST_NS, LATEST_NS + 1, LATE_NS), key=partial(residual_px, body))
+        late = minimize_scalar(partial(residual_px, body), bounds=(near - LATE_NS, near + LATE_NS))
+        changes = [(late.fun, f"{abs(late.x) / 1e6:.0f} ms {'later' if late.x > 0 else 'earlier'}")]
         limits = {"initial_simplex": np.eye(4, 3, -1), "maxfev": TRIED_POINTS}
         best = minimize(
             lambda x: residual_px(rigid(x, body[:3, :3])), np.zeros(3), method="Nelder-Mead", options=limits
@@ -372,7 +377,7 @@ class Judged:
             place = f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"
             changes.append((best.fun, place))
         without, text = min(changes)
-        if chosen.residual_px <= OFF * without or without > LEAST_OFF_PX:
+        if chosen.residual_px <= OFF * without or without > most_px:
             return ""
         fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if the poses are {text}"
         return f"{reading.words()} {fit}"
