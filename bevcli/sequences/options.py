@@ -150,7 +150,9 @@ def _number(text: str) -> float:
     return value
 
 
-RigAngle: TypeAlias = Literal["wxyz", "xyzw", "vector", "radians", "degrees", "clockwise", "clockwise-radians", "unity"]
+RigAngles: TypeAlias = Literal[
+    "wxyz", "xyzw", "vector", "radians", "degrees", "clockwise", "clockwise-radians", "unity"
+]
 PoseAngles: TypeAlias = Literal[
     "degrees", "radians", "compass", "compass-radians", "clockwise", "clockwise-radians", "vector", "wxyz", "xyzw"
 ]
@@ -187,7 +189,7 @@ class RigOptions:
         help="Axes of the cameras in --calibration: x right, y down (optical); x forward, y left (vehicle); x right, y "
         "up, z backward (opengl) or forward (unity); x forward, y right, z up (unreal) or down (ned).",
     )
-    rig_angles: RigAngle | None = option(
+    rig_angles: RigAngles | None = option(
         default=None,
         help="Rotation in --calibration: a quaternion (wxyz, xyzw), a rotation vector (vector), or roll, pitch and yaw "
         "(radians, degrees, clockwise, clockwise-radians, or unity: about z, x and y). Default: what the images show.",
