@@ -1,5 +1,6 @@
 """A true drive in the conventions of other programs is read right, or a question names the options that decide."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -133,6 +134,19 @@ def test_poses_that_would_fit_much_better_otherwise_are_refused(change, stated, 
         opened(tmp_path, options, **stated)
     if told not in IMPOSSIBLE:
         opened(tmp_path, options, image_check=False, pose_axes="flu", pose_transform="world_from_body", rig_unit="m")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "lens", [{"D": [-0.3, 0.1, 0, 0, 0]}, {"D": [0.05, 0.01, 0, 0], "distortion_model": "equidistant"}]
+)
+def test_a_lens_of_rectified_images_is_refused(lens, tmp_path):
+    drive = open_sequence(STREET, every=2, frames=slice(0, 8), ground_truth=False)
+    options = write(drive, tmp_path, Convention())
+    rig = json.loads(options["calibration"].read_text())
+    options["calibration"].write_text(json.dumps({name: camera | lens for name, camera in rig.items()}))
+    with pytest.raises(InputError, match="if the images are rectified, without the lens distortion"):
+        opened(tmp_path, options)
 
 
 def answered(folder, options, **stated):

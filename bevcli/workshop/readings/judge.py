@@ -266,8 +266,8 @@ class Judged:
             )
         if wrong := wrong or self._other_scale(left[0]):
             raise InputError(
-                f"{self._files(BOTH)}: {wrong}; correct the poses, pass `odometry=True` (`--odometry`) in place of "
-                "them, or `image_check=False` (`--no-image-check`) to read them so"
+                f"{self._files(BOTH)}: {wrong}; correct the files, pass `odometry=True` (`--odometry`) in place of "
+                "the poses, or `image_check=False` (`--no-image-check`) to read them so"
             )
         others = [each for each in found if not each.is_like(left[0])]
         if not others or not np.isfinite(best.residual_px):
@@ -322,7 +322,7 @@ class Judged:
         )
 
     def _other_fit(self, chosen: Candidate, found: Sequence[Candidate]) -> str:
-        """How poses that are late, or of another point, would fit much better than as they are read; "" if not so.
+        """How late poses, of another point, or images without a lens would fit much better; "" if not so.
 
         An unusual rig is not believed where a usual one would fit as well so. found: all readings.
         """
@@ -350,7 +350,7 @@ class Judged:
         return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
 
     def _late_or_elsewhere(self, chosen: Candidate, most_px: float) -> str:
-        """What the poses are with which the images fit much better: late, or of another point; "" if nothing.
+        """How the images would fit much better: with late poses, of another point, or without a lens; "" if not so.
 
         most_px: the largest residual of what fits.
         """
@@ -367,19 +367,22 @@ class Judged:
 
         near = min(range(-LATEST_NS, LATEST_NS + 1, LATE_NS), key=partial(residual_px, body))
         late = minimize_scalar(partial(residual_px, body), bounds=(near - LATE_NS, near + LATE_NS))
-        changes = [(late.fun, f"{abs(late.x) / 1e6:.0f} ms {'later' if late.x > 0 else 'earlier'}")]
+        changes = [(late.fun, f"the poses are {abs(late.x) / 1e6:.0f} ms {'later' if late.x > 0 else 'earlier'}")]
+        if any(pair.camera.distortion for pair in self._pairs):
+            without_lens = points.without_lens().residual_px(chosen.cameras, chosen.steps)
+            changes.append((without_lens, "the images are rectified, without the lens distortion that is stated"))
         limits = {"initial_simplex": np.eye(4, 3, -1), "maxfev": TRIED_POINTS}
         best = minimize(
             lambda x: residual_px(rigid(x, body[:3, :3])), np.zeros(3), method="Nelder-Mead", options=limits
         )
         if np.linalg.norm(best.x) < FARTHEST_POINT_M:
             x, y, z = best.x
-            place = f"of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"
+            place = f"the poses are of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"
             changes.append((best.fun, place))
         without, text = min(changes)
         if chosen.residual_px <= OFF * without or without > most_px:
             return ""
-        fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if the poses are {text}"
+        fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if {text}"
         return f"{reading.words()} {fit}"
 
     def _on_both_sides(self, left: Sequence[Candidate]) -> tuple[Candidate, str]:

@@ -7,7 +7,7 @@ and at any other height the points of the plane road are elsewhere in the second
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
 import cv2
@@ -37,6 +37,7 @@ SHORTEST_M, LONGEST_M = 0.7, 12.0  # of a step between two frames
 LONGEST_NS = 2_500_000_000
 UNSEEN_NS = 400_000_000  # between two frames of a drive without poses
 MOST = 4  # pairs of frames
+FAR_M = 100.0  # of points on rays; any distance gives their pixels
 MOST_PX = 20.0  # a larger residual counts as this
 SHORTEST_WAY_M = 0.02  # a shorter way of a camera has no direction
 PARALLAX_PX = 2.0  # from which a point tells on which side of the camera it is
@@ -163,6 +164,10 @@ class MatchedPoints:
             medians.append(min(float(np.median(off[start:end])), MOST_PX))
         return float(np.average(medians, weights=np.diff(self._bounds)))
 
+    def without_lens(self) -> "MatchedPoints":
+        """The same pixels, as if the images had no lens distortion, though their cameras state one."""
+        return MatchedPoints([_without_lens(pair) for pair in self.pairs])
+
     def motions_seen(self, ego_from_camera: Array) -> Array:
         """(P, 4, 4) ego_b_from_ego_a by the images alone: a vehicle that drives along an arc."""
         motions = np.broadcast_to(np.eye(4), (len(self.pairs), 4, 4)).copy()
@@ -209,6 +214,12 @@ class PointsAtOnce:
         of_a, of_b = (np.stack([ego_from_camera[names[side]] for names in self._names]) for side in (0, 1))
         stands = np.broadcast_to(np.eye(4), of_a.shape)
         return int((_off_px(self._points, GroupGeometry(of_a, of_b, stands, np.zeros(2))) < AT_ONCE_PX).sum())
+
+
+def _without_lens(pair: CameraPair) -> CameraPair:
+    pinhole = replace(pair.camera, distortion=None)
+    rays_a, rays_b = (pinhole.rays(pair.camera.project(FAR_M * rays)[0]) for rays in (pair.rays_a, pair.rays_b))
+    return replace(pair, rays_a=rays_a, rays_b=rays_b)
 
 
 def _off_px(points: EpipolarResiduals, geometry: GroupGeometry) -> Array:
