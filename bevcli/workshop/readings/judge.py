@@ -44,6 +44,7 @@ SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that 
 CONTRADICTING = 3.0  # the same factor, of what is stated
 LEAST_OFF_PX, OFF = 0.4, 2.2  # residual of poses that may be late or of another point; how much smaller it is without
 LATE_NS, LATEST_NS = 50_000_000, 500_000_000  # step in which the times of the poses are tried, and the largest
+LEAST_LATE_NS = 40_000_000  # a smaller one, such as an exposure and the way through a driver, is no mistake of a file
 TRIED_POINTS, FARTHEST_POINT_M = 80, 4.0  # of the vehicle, that the poses may be of
 OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those of a rig that is certain
 CLEAR_HEIGHT = 1.5  # clearness of a height that is believed
@@ -367,7 +368,10 @@ class Judged:
 
         near = min(range(-LATEST_NS, LATEST_NS + 1, LATE_NS), key=partial(residual_px, body))
         late = minimize_scalar(partial(residual_px, body), bounds=(near - LATE_NS, near + LATE_NS))
-        changes = [(late.fun, f"the poses are {abs(late.x) / 1e6:.0f} ms {'later' if late.x > 0 else 'earlier'}")]
+        changes = []
+        if abs(late.x) >= LEAST_LATE_NS:
+            word = "later" if late.x > 0 else "earlier"
+            changes.append((late.fun, f"the poses are {abs(late.x) / 1e6:.0f} ms {word}"))
         if any(pair.camera.distortion for pair in self._pairs):
             without_lens = points.without_lens().residual_px(chosen.cameras, chosen.steps)
             changes.append((without_lens, "the images are rectified, without the lens distortion that is stated"))
@@ -379,7 +383,7 @@ class Judged:
             x, y, z = best.x
             place = f"the poses are of a point {x:.1f} m ahead, {y:.1f} left and {z:.1f} above the vehicle's origin"
             changes.append((best.fun, place))
-        without, text = min(changes)
+        without, text = min(changes, default=(np.inf, ""))
         if chosen.residual_px <= OFF * without or without > most_px:
             return ""
         fit = f"fits the images by {chosen.residual_px:.1f} px, but by {without:.1f} px if {text}"
