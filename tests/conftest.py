@@ -24,8 +24,8 @@ FIRST = ("processes", "rendered", "test_resume", "test_equals_original", "test_r
 
 def pytest_configure(config: pytest.Config) -> None:
     """Only a process that runs tests imports the fixtures: PyTorch takes seconds."""
-    gc.disable()  # until all modules are imported, whose objects stay
     if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
+        gc.disable()  # until all modules are imported, whose objects stay
         config.pluginmanager.import_plugin("shared_fixtures")
 
 

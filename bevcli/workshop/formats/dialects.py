@@ -86,7 +86,8 @@ def _of_frames(document: Any, path: Path) -> Any:
     stamped = _stamped(document, path)
     frames = stamped or _frames(document, path)
     own = list(frames)
-    beside, is_whole = path.parent / ON_VEHICLE, all(_from_root(frames, frame)[0] == VEHICLE for frame in own)
+    beside = path.parent / ON_VEHICLE
+    is_whole = all(_from_root(frames, frame)[0] == VEHICLE for frame in own)
     if stamped and not is_whole:
         files = [file for file in path.parent.glob("*.yaml") if file != path]
         frames = {name: at for file in files for name, at in _stamped(read_yaml(file), file).items()} | frames

@@ -116,7 +116,8 @@ def read_poses(path: Path, drive: DrivePoses) -> ReadPoses | None:
 
 def refuse_statements(path: Path, stated: RigOptions) -> None:
     """Raise InputError where options state what poses are that are certain."""
-    for name in (name for name in (*POSE_STATEMENTS, "pose_times") if getattr(stated, name) is not None):
+    name = next((name for name in (*POSE_STATEMENTS, "pose_times") if getattr(stated, name) is not None), None)
+    if name is not None:
         raise InputError(f"{path}: states what its poses are: pass {named(RigOptions, name)} with {FOLDER}, or none")
 
 

@@ -44,6 +44,7 @@ SAME_RAD, SAME_M, SAME = np.radians(0.25), 0.02, 0.01  # steps and cameras that 
 CONTRADICTING = 3.0  # the same factor, of what is stated
 LEAST_OFF_PX, OFF = 0.4, 2.2  # residual of poses that may be late or of another point; how much smaller it is without
 LATE_NS, LATEST_NS = 50_000_000, 500_000_000  # step in which the times of the poses are tried, and the largest
+LATE_WITHIN_NS = 500_000  # how exactly their best time is found
 LEAST_LATE_NS = 40_000_000  # a smaller one, such as an exposure and the way through a driver, is no mistake of a file
 TRIED_POINTS, FARTHEST_POINT_M = 80, 4.0  # of the vehicle, that the poses may be of
 OTHER_SCALE = 1.25  # of heights above the road, that the poses tell, over those of a rig that is certain
@@ -330,9 +331,9 @@ class Judged:
         if chosen.poses is None or len(self._pairs) < FEWEST_PAIRS:
             return ""
         usual = next((each for each in found if each.rank < chosen.rank and each.poses is chosen.poses), None)
-        if usual and (text := self._late_or_elsewhere(usual, min(chosen.residual_px, LEAST_OFF_PX))):
+        if usual and (text := self._fits_otherwise(usual, min(chosen.residual_px, LEAST_OFF_PX))):
             return text
-        return "" if chosen.residual_px <= LEAST_OFF_PX else self._late_or_elsewhere(chosen, LEAST_OFF_PX)
+        return "" if chosen.residual_px <= LEAST_OFF_PX else self._fits_otherwise(chosen, LEAST_OFF_PX)
 
     def _other_scale(self, chosen: Candidate) -> str:
         """The share of the ways that the poses state, by the height of the cameras above the road; "" if it is all."""
@@ -350,7 +351,7 @@ class Judged:
             return ""
         return f"by the road in the images, the poses state {scale:.2f} of the ways that the vehicle drives"
 
-    def _late_or_elsewhere(self, chosen: Candidate, most_px: float) -> str:
+    def _fits_otherwise(self, chosen: Candidate, most_px: float) -> str:
         """How the images would fit much better: with late poses, of another point, or without a lens; "" if not so.
 
         most_px: the largest residual of what fits.
@@ -367,7 +368,9 @@ class Judged:
             return points.residual_px(chosen.cameras, steps)
 
         near = min(range(-LATEST_NS, LATEST_NS + 1, LATE_NS), key=partial(residual_px, body))
-        late = minimize_scalar(partial(residual_px, body), bounds=(near - LATE_NS, near + LATE_NS))
+        late = minimize_scalar(
+            partial(residual_px, body), bounds=(near - LATE_NS, near + LATE_NS), options={"xatol": LATE_WITHIN_NS}
+        )
         changes = []
         if abs(late.x) >= LEAST_LATE_NS:
             word = "later" if late.x > 0 else "earlier"
