@@ -179,6 +179,8 @@ class BEVFormer(Network):
         projections, sizes = torch.eye(4).expand(*images.shape[:2], 4, 4), torch.ones(*images.shape[:2], 2)
         cameras = projections, projections, camera_index, has_image, sizes
         boxes = None if self.image_detector is None else self.find_image_boxes(images, has_image, sizes)
+        if self.horizon is not None:
+            self.find_slopes(images, projections)
         self.compute(EncoderInputs(images, *cameras, can_bus, shift, hits, None, history, rotation, boxes))
 
     @classmethod

@@ -159,6 +159,7 @@ class ModelConfig:
             denominator; a detector beside it sees them whole.
         image_detector: a detector beside the backbone, for the boxes in the images. None: the backbone itself, if it
             is one, tells these boxes.
+        horizon: the rig of each frame is levelled first, by the slopes of the road that `Horizon` tells.
         neck: the feature pyramid network.
         image_tokens: camera and level embeddings.
         ego_motion: can-bus numbers and alignment of the history.
@@ -186,6 +187,7 @@ class ModelConfig:
     backbone: ResNetConfig | EfficientNetLiteConfig | NanoDetConfig = field(default_factory=ResNetConfig)
     backbone_scale: tuple[int, int] = (1, 1)
     image_detector: NanoDetConfig | None = None
+    horizon: bool = False
     neck: FPNConfig = field(default_factory=FPNConfig)
     image_tokens: ImageTokensConfig = field(default_factory=ImageTokensConfig)
     ego_motion: EgoMotionConfig = field(default_factory=EgoMotionConfig)
@@ -205,6 +207,8 @@ class ModelConfig:
             raise ValueError('hybrid_queries needs image_detector, or a backbone that is a detector, such as "nanodet"')
         if self.hybrid_queries.count and self.hybrid_queries.features != CHANNELS:
             raise ValueError(f"hybrid_queries.features must be the channels of the detector's maps, {CHANNELS}")
+        if self.horizon and self.levels:
+            raise ValueError("horizon and hybrid_queries.level both level the rig of each frame: leave out one of them")
         smaller, whole = self.backbone_scale
         if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
             raise ValueError("backbone_scale must be at most 1, and image.pad_divisor times it a whole number")

@@ -16,7 +16,7 @@ from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
 from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
 from bevcli.model.pillar_projection import project_points
-from bevcli.model.road_slopes import RoadSlopes, level_from_bev
+from bevcli.model.road_slopes import RoadSlopes, levelled
 from bevcli.model.upload import upload_together
 from bevcli.parsing.documents import Count, CountOrNone
 
@@ -92,10 +92,10 @@ class HybridQueries(nn.Module):
     def levelled(
         self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor, expected: RoadSlopes | None = None
     ) -> tuple[Tensor, RoadSlopes]:
-        """(B, N, 4, 4), pixels from a bev frame that is level with the road, and the slopes of the road; on the CPU.
+        """(B, N, 4, 4), see `levelled`, and the slopes of the road; on the CPU.
 
-        It is turned about the point of the road below its origin, and the less, the less sure the slope is. Arguments:
-        see `forward`; all but the boxes are on the CPU.
+        The frame is turned the less, the less sure the slope is. Arguments: see `forward`; all but the boxes are on the
+        CPU.
         """
         cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
         told = self.lift(boxes, *cameras)[-1]
@@ -105,11 +105,7 @@ class HybridQueries(nn.Module):
         information = inverse_of_two(covariance)
         sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
         slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
-        axes = [torch.stack(axis, -1) for axis in level_from_bev(*slopes.unbind(-1))]  # of the level frame
-        bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
-        bev_from_level[:, :3, :3] = torch.stack(axes, -1)
-        bev_from_level[:, :3, 3] = self.lift.ground_z * (slopes.new_tensor([0.0, 0.0, 1.0]) - axes[2])
-        return image_from_bev @ bev_from_level[:, None], told
+        return levelled(image_from_bev, slopes, -self.lift.ground_z), told
 
     def weighed(
         self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]

@@ -15,11 +15,12 @@ from bevcli.model.decoder import Decoder, DetectionHead
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.encoder import Encoder
 from bevcli.model.fpn import FPN
+from bevcli.model.horizon import Horizon
 from bevcli.model.hybrid_queries import HybridQueries
 from bevcli.model.image_boxes import ImageBoxes
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.pillar_projection import PillarHits, Pillars
-from bevcli.model.road_slopes import RoadSlopes, upright_images
+from bevcli.model.road_slopes import RoadSlopes, levelled, upright_images
 from bevcli.model.segmentation import SegmentationHead
 from bevcli.model.step import Clip, ModelOutputs
 from bevcli.model.temporal_model import TemporalModel, build_model
@@ -43,6 +44,7 @@ class Network(TemporalModel):
         bev_shape = (grid.rows, grid.columns)
         self.backbone = config.backbone.build()
         self.image_detector = config.image_detector.build() if config.image_detector else None
+        self.horizon = Horizon() if config.horizon else None
         self.neck = FPN(config.backbone.output_channels(), channels, config.neck)
         self.image_tokens = ImageTokens(len(config.cameras), channels, config.image_tokens)
         hybrid, height_m = config.hybrid_queries, config.bev_frame.height_m
@@ -90,6 +92,12 @@ class Network(TemporalModel):
         assert self.image_detector is not None
         return self.image_detector.image_boxes(self.image_detector(images.flatten(0, 1)), has_image, image_sizes)
 
+    @on_device
+    def find_slopes(self, images: Tensor, image_from_bev: Tensor) -> Tensor:
+        """(B, 2) the slopes of the road that the horizon tells. Arguments: see `ModelInputs`."""
+        assert self.horizon is not None
+        return self.horizon(*upload_together((images, image_from_bev), self.device)).mean
+
     def look(
         self,
         images: Tensor,
@@ -98,12 +106,15 @@ class Network(TemporalModel):
         image_sizes: Tensor,
         expected: RoadSlopes | None = None,
     ) -> tuple[ImageBoxes | None, Tensor, RoadSlopes | None]:
-        """The boxes of the detector beside the backbone, None without one; the rig as they level it; the road's slopes.
+        """The boxes of the detector beside the backbone, None without one; the level rig; the slopes that boxes tell.
 
-        The rig is image_from_bev itself, the slopes None, where the model does not level it.
+        The rig is image_from_bev itself where the model does not level it; the slopes are None where no boxes do.
 
         expected: slopes, see `expected_slopes`. Others: see `ModelInputs`.
         """
+        if self.horizon is not None:
+            slopes = self.find_slopes(images, image_from_bev).to(image_from_bev.device)
+            image_from_bev = levelled(image_from_bev, slopes, self.config.bev_frame.height_m)
         if self.image_detector is None:
             return None, image_from_bev, None
         boxes = self.find_image_boxes(images, has_image, image_sizes)
@@ -186,6 +197,7 @@ class Network(TemporalModel):
         for stage, name in enumerate(self.config.backbone.stage_names()):
             yield f"backbone: stage {stage + 1}, {name}", f"backbone.stages.{stage}"
         yield "detector of boxes in the images", "image_detector"
+        yield "horizon: slopes of the road", "horizon"
         yield "neck (FPN)", "neck"
         yield "level embeddings", "image_tokens.level_embedding"
         yield "camera embeddings", "image_tokens.camera_embedding"

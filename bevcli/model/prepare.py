@@ -19,6 +19,7 @@ from bevcli.model.decoder import DecoderLayer
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.efficientnet_lite import EfficientNetLite
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.horizon import Ring
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.kernels import choose
 from bevcli.model.kernels.compiled import CompiledPool, load_compiled
@@ -181,6 +182,7 @@ class TokensInBlocks(ImageTokens):
 # The classes that take the place of plain ones on a CPU, beside those of `choose_kernels`.
 CPU_KINDS: choose.Kinds = {
     Pillars: choose.KeptPillars,
+    Ring: choose.KeptRing,
     CalibrationEmbedding: choose.KeptCalibrationEmbedding,
     EfficientNetLite: EfficientNetLiteByImage,
     ImageTokens: TokensInBlocks,

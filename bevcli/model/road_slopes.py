@@ -168,6 +168,18 @@ def level_from_bev(along_x: Any, along_y: Any) -> Any:
     return (x, 0 * x, x * along_x), left, (-z * along_x, -z * along_y, z)
 
 
+def levelled(image_from_bev: Tensor, slopes: Tensor, height_m: float) -> Tensor:
+    """(B, N, 4, 4), pixels from a bev frame that is level with the road, turned about the point of the road below it.
+
+    image_from_bev: (B, N, 4, 4). slopes: (B, 2), on the same device. height_m: of the bev frame above the road.
+    """
+    axes = [torch.stack(axis, -1) for axis in level_from_bev(*slopes.unbind(-1))]  # of the level frame
+    bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
+    bev_from_level[:, :3, :3] = torch.stack(axes, -1)
+    bev_from_level[:, :3, 3] = height_m * (axes[2] - slopes.new_tensor([0.0, 0.0, 1.0]))
+    return image_from_bev @ bev_from_level[:, None]
+
+
 def _level(world_from_bev: Array) -> Array:
     """(4, 4): a pose without pitch, roll and height."""
     level = np.eye(4)

@@ -112,7 +112,9 @@ def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, 
     with simulated(device_name, monkeypatch, sample_plainly) as device:
         fast = prepare_for_inference(model, device.device)
         found = run(fast, device.device, prepared, device.waits)
-    used = set(methods_on_device(type(fast))) - ({"find_image_boxes"} if model.image_detector is None else set())
+    used = set(methods_on_device(type(fast)))
+    used -= {"find_image_boxes"} if model.image_detector is None else set()
+    used -= {"find_slopes"} if model.horizon is None else set()
     for name in used if device_name == "cuda:1" else ():
         part = getattr(fast, name)
         assert part.failure is None
@@ -123,13 +125,14 @@ def test_a_step_computes_on_its_device_and_waits_for_results(name, device_name, 
         if ours.segmentation is not None:
             assert (theirs.segmentation.cells == ours.segmentation.cells).mean() > 0.999
     if device_name == "cuda:1" and not isinstance(config, UniADConfig):
-        slope = ["copy to the CPU"] * config.hybrid_queries.level  # which levels the rig before pillars are projected
+        levels = config.horizon or config.hybrid_queries.level  # the rig, before pillars are projected
+        slope = ["copy to the CPU"] * levels
         assert device.waits == [*slope, "event"]
 
 
 @pytest.mark.slow
 def test_a_step_uploads_once_and_reads_back_once(monkeypatch):
-    config = small_version("demo")
+    config = replace(small_version("demo"), horizon=False)
     model, prepared = made_up_model(config), frames(config, same_projection=True)
     copied = []
     with simulated("cuda:0", monkeypatch, sample_plainly) as device:
@@ -332,7 +335,8 @@ def test_an_interrupted_run_on_a_gpu_has_all_frames(mini_model, tmp_path, monkey
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["demo", "v2-t8", "vad-tiny", "tiny"])
 def test_a_gpu_gets_the_next_frame_before_results_are_waited_for(name, monkeypatch):
-    """Each frame waits once, for its own results: what the device copies has no numbers before."""
+    """Each frame waits once, for its own results: what the device copies has no numbers before. The slopes of the road,
+    where the horizon tells them, are waited for before a frame is launched."""
     config, count = small_version(name), 4  # the first ones warm up and are captured
     model, drive = made_up_model(config), MemoryDrive(count)
     expected = list(Runner(model, CPU, tracker=TRACKER).run(drive))
@@ -345,7 +349,8 @@ def test_a_gpu_gets_the_next_frame_before_results_are_waited_for(name, monkeypat
         monkeypatch.setattr(runner, "begin", lambda *given: (begin(*given), device.waits.append("launched"))[0])
         found = list(runner.run(drive))
     order = device.waits[device.waits.index("launched") :]
-    assert order == ["launched", *["launched", "event"] * (count - 1), "event"]
+    slope = ["copy to the CPU"] * config.horizon
+    assert order == ["launched", *[*slope, "launched", "event"] * (count - 1), "event"]
     for (_, ours, _), (_, theirs, _) in zip(found, expected, strict=True):
         assert ours.stamp == theirs.stamp
         np.testing.assert_allclose(ours.boxes.centers, theirs.boxes.centers, atol=1e-3)

@@ -16,6 +16,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_weights
 from bevcli.model.deformable_attention import DeformableAttention, GridSampling, SampleHits
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.encoder import SpatialCrossAttention, TemporalSelfAttention
+from bevcli.model.horizon import Ring
 from bevcli.model.image_tokens import CalibrationEmbedding
 from bevcli.model.kernels.compiled import CompiledDeformableConvolution, CompiledSampling, sample_hits
 from bevcli.model.network import Network
@@ -124,6 +125,10 @@ class LastCall(nn.Module):
 
 class KeptPillars(LastCall, Pillars):
     """`Pillars` that find the hits anew where the cameras have moved."""
+
+
+class KeptRing(LastCall, Ring):
+    """A `Ring` that looks anew where the cameras have moved."""
 
 
 class KeptCalibrationEmbedding(LastCall, CalibrationEmbedding):

@@ -189,6 +189,7 @@ def model_table(name: str, preset: Preset, data: DataFacts) -> dict[str, Any]:
     if data.map_reach_m < half:
         table["heads"] = ["detection"]
         table.pop("segmentation", None)
+    table.pop("horizon", None)  # it knows renderings only, and is not trained
     training = table.setdefault(TRAINING, {})
     training.pop("rigs", None)  # of rendered drives
     training["freeze_batch_norm"] = True  # a few small batches of other images would spoil the statistics
