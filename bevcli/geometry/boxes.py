@@ -252,26 +252,6 @@ def attributes_by_speed(boxes: Boxes3D, classes: Mapping[str, ObjectClass] = NUS
     return np.array([pair[0 if fast else 1] for pair, fast in zip(choices, moving, strict=True)], dtype=np.str_)
 
 
-MAX_GAP_S = 1.5  # longest time between two annotations of an object from which a velocity is derived
-
-
-def velocities_between(centers: Array, times_s: Array, first: NDArray[np.int64], last: NDArray[np.int64]) -> Array:
-    """(A, 3) m/s, NaN if unknown: central differences, one-sided for an object's first and last annotation.
-
-    As in the official nuScenes devkit, a velocity is known if each time gap is at most 1.5 s on average.
-
-    centers: (A, 3) metres, world frame. times_s: (A,) seconds. first, last: (A,) rows of the annotations of the same
-    object before and after; the own row where there is none.
-    """
-    rows = np.arange(len(centers))
-    seconds = times_s[last] - times_s[first]
-    longest = MAX_GAP_S * ((first != rows).astype(int) + (last != rows))
-    is_short = (seconds > 0) & (seconds <= longest)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
-    return np.where(is_short[:, None], velocities, np.nan)
-
-
 @dataclass(frozen=True)
 class Box2D:
     """One of `Boxes2D`.

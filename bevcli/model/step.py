@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from bevcli.errors import InputError
@@ -239,41 +238,6 @@ def _image_sizes(prepared: PreparedFrame, config: ModelConfig) -> Tensor:
         for camera, scale in zip(cameras, prepared.scales, strict=True)
     ]
     return torch.tensor(sizes, dtype=torch.float32)[None]
-
-
-def joined_inputs(parts: Sequence[ModelInputs]) -> ModelInputs:
-    """The inputs of several batches as one batch, without slopes that were expected.
-
-    Raises InputError where they have different numbers of cameras.
-    """
-    counts = sorted({part.has_image.shape[1] for part in parts})
-    if len(counts) > 1:
-        raise InputError(
-            f"{counts[0]} and {counts[-1]} cameras cannot go into one batch: use sequences with the same number of "
-            "cameras, or batches of 1"
-        )
-    names = [field.name for field in fields(ModelInputs) if field.name != "expected_slopes"]
-    tensors = {name: [getattr(part, name) for part in parts] for name in names}
-    images, indices = tensors.pop("images"), tensors.pop("camera_index")
-    same = all(torch.equal(index, indices[0]) for index in indices)
-    rows = [index.expand(len(part.has_image), -1) for index, part in zip(indices, parts, strict=True)]
-    index = indices[0] if same and indices[0].ndim == 1 else torch.cat(rows)
-    joined: dict[str, Any] = {name: torch.cat(values) for name, values in tensors.items()}
-    return ModelInputs(images=_together(images), camera_index=index, **joined)
-
-
-def _together(images: list[Tensor]) -> Tensor:
-    """Images (B, N, 3, H, W) of several batches, padded with zeros at right and bottom to the largest of them.
-
-    They are joined channels last, as they lie in memory.
-    """
-    height, width = (max(batch.shape[axis] for batch in images) for axis in (-2, -1))
-
-    def padded(batch: Tensor) -> Tensor:
-        missing = (0, width - batch.shape[-1], 0, height - batch.shape[-2])
-        return (F.pad(batch, missing) if any(missing) else batch).movedim(2, -1)
-
-    return torch.cat([padded(batch) for batch in images]).movedim(-1, 2)
 
 
 def assign_cameras(

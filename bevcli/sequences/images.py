@@ -32,7 +32,6 @@ CONTAINERS = (
 )  # fmt: skip
 TS_PACKET = 188  # bytes of an MPEG transport stream; each begins with G, in .m2ts after a time
 MOST_PIXELS = 1 << 26  # of an image in a video or a bag
-SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 
 
 class VideoReader:
@@ -107,14 +106,6 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     return capture
 
 
-def size_of_video(path: Path) -> tuple[int, int]:
-    """(width, height) of the images of a video, pixels. Raises InputError as `open_capture`."""
-    capture = open_capture(path)
-    width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    capture.release()
-    return width, height
-
-
 def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:
     """A note on each video with a tag by which players turn its images. Videos that cannot be read have none."""
     for path in paths:
@@ -122,16 +113,6 @@ def rotation_notes(paths: Iterable[Path]) -> Iterator[str]:
             degrees = open_capture(path).get(cv2.CAP_PROP_ORIENTATION_META)
             if degrees % 360:
                 yield f"{path}: has a rotation tag ({degrees:.0f} degrees): its images are read as they are stored"
-
-
-def count_and_rate(path: Path) -> tuple[int, float]:
-    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
-    capture = open_capture(path)
-    count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
-    capture.release()
-    if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
-        raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
-    return int(count), rate
 
 
 DECODING_THREADS = 6

@@ -21,7 +21,7 @@ from bevcli.geometry.boxes import OPTIONAL_COLUMNS, Boxes3D, Column
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.printing import counted
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.sequences.files.boxes_file import FrameBoxes
 
 Row = dict[str, pa.Scalar]
 
@@ -222,20 +222,6 @@ def _applied(state: Mapping[str, Row], rows: list[Logged]) -> dict[str, Row]:
         else:
             state[entity] = {**state.get(entity, {}), **{n: value for n, value in row.items() if value.is_valid}}
     return state
-
-
-def read_recording(recording: Path) -> BoxesFile:
-    """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
-    frames = list[FrameBoxes]()
-    for frame in RecordingReader(recording).frames():
-        if names := frame.texts(entities.RUN, "layer_names"):
-            raise InputError(
-                f"{recording}: compares {' and '.join(names)} (expected boxes of one model): use their files"
-            )
-        frames.append(recorded_boxes(frame))
-    if not frames:
-        raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
-    return BoxesFile("world", tuple(frames))
 
 
 def recorded_boxes(frame: RecordedFrame) -> FrameBoxes:

@@ -26,10 +26,12 @@ from bevcli.parsing.images import decode_image
 from bevcli.recording import entities, has_av, require_av
 from bevcli.recording.blueprint import rows_by_yaw
 from bevcli.recording.entities import Color, class_colors, map_colors
-from bevcli.viewer import VideoView, drawing
-from bevcli.viewer.drawing import Canvas, Tile, ToCanvas
+from bevcli.viewer import VideoView
+from bevcli.viewer.drawing import Canvas, draw_lines
 from bevcli.viewer.recording_file import open_recording
 from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader
+from bevcli.workshop import plot
+from bevcli.workshop.plot import Tile, ToCanvas
 from bevcli.writing import whole_file
 
 if has_av():
@@ -89,7 +91,7 @@ def draw_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     strips = frame.strips(entity, STRIPS)
     colors = entity_colors(frame, entity, "LineStrips2D:colors", len(strips))
     for strip, color in zip(strips, colors, strict=True):
-        drawing.draw_lines(canvas, [to_canvas(strip)], color, thickness)
+        draw_lines(canvas, [to_canvas(strip)], color, thickness)
 
 
 def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas) -> None:
@@ -102,7 +104,7 @@ def draw_faded_strips(canvas: Canvas, frame: RecordedFrame, entity: str, to_canv
     for level in np.unique(step[step > 0]):
         below = canvas.copy()
         for index in np.flatnonzero(step == level):
-            drawing.draw_lines(canvas, [to_canvas(strips[index])], colors[index])
+            draw_lines(canvas, [to_canvas(strips[index])], colors[index])
         canvas[:] = cv2.addWeighted(canvas, level / OPACITIES, below, 1 - level / OPACITIES, 0)
 
 
@@ -112,7 +114,7 @@ def draw_arrows(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     ends = starts + frame.array(entity, "Arrows2D:vectors", 2, len(starts))
     colors = entity_colors(frame, entity, "Arrows2D:colors", len(starts))
     for start, end, color in zip(to_canvas(starts), to_canvas(ends), colors, strict=True):
-        drawing.draw_arrow(canvas, start, end, color)
+        plot.draw_arrow(canvas, start, end, color)
 
 
 def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: ToCanvas, size: float = 0.4) -> None:
@@ -120,7 +122,7 @@ def draw_labels(canvas: Canvas, frame: RecordedFrame, entity: str, to_canvas: To
     positions = to_canvas(frame.array(entity, "Points2D:positions", 2))
     colors = entity_colors(frame, entity, "Points2D:colors", len(positions))
     for text, (x, y), color in zip(frame.texts(entity, "Points2D:labels"), positions, colors, strict=False):
-        drawing.draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
+        plot.draw_text(canvas, text, (int(x), int(y)), color, size, centered=True)
 
 
 def entity_colors(frame: RecordedFrame, entity: str, component: str, count: int) -> list[tuple[int, int, int]]:
@@ -148,7 +150,7 @@ def tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
     sizes = {name: _camera_size(frame, name) for name in frame.texts(entities.RUN, "camera_names")}
     if not sizes:
         raise frame.wrong(entities.RUN, "camera_names", "the names of cameras", "none")
-    return drawing.tiles_of(sizes, _camera_yaws(frame))
+    return plot.tiles_of(sizes, _camera_yaws(frame))
 
 
 def _camera_size(frame: RecordedFrame, camera: str) -> Array:
@@ -172,12 +174,12 @@ def draw_frame(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedI
 
     layout: where each camera's image goes. images: decodes them; frames must come in order.
     """
-    canvas = drawing.new_sheet()
+    canvas = plot.new_sheet()
     for tile in layout:
         image = images.image(frame, tile.camera)
         _draw_camera(canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width], frame, tile, image)
-    _draw_bev(canvas[:, drawing.CAMERAS_WIDTH :], frame)
-    _draw_legend(canvas[drawing.CAMERAS_HEIGHT :, : drawing.CAMERAS_WIDTH], frame)
+    _draw_bev(canvas[:, plot.CAMERAS_WIDTH :], frame)
+    _draw_legend(canvas[plot.CAMERAS_HEIGHT :, : plot.CAMERAS_WIDTH], frame)
     return canvas
 
 
@@ -197,15 +199,15 @@ def image_tiles(frame: RecordedFrame) -> tuple[Tile, ...]:
 def draw_images(frame: RecordedFrame, layout: tuple[Tile, ...], images: RecordedImages) -> Canvas:
     """The images of a frame at their own size, with the boxes: (H, W, 3) uint8 BGR, H and W even, as videos need."""
     width, height = (max(end) for end in zip(*((t.left + t.width, t.top + t.height) for t in layout), strict=True))
-    canvas = np.full((height + height % 2, width + width % 2, 3), drawing.BACKGROUND, dtype=np.uint8)
+    canvas = np.full((height + height % 2, width + width % 2, 3), plot.BACKGROUND, dtype=np.uint8)
     for tile in layout:
         part = canvas[tile.top : tile.top + tile.height, tile.left : tile.left + tile.width]
         image = images.image(frame, tile.camera)
         if image is None:
-            drawing.draw_title(part, tile.camera, has_image=False)
+            plot.draw_title(part, tile.camera, has_image=False)
             continue
         part[:] = image[: tile.height, : tile.width]
-        camera, size = entities.camera(tile.camera), max(drawing.SMALL_TEXT, tile.width * drawing.LABEL_SHARE)
+        camera, size = entities.camera(tile.camera), max(plot.SMALL_TEXT, tile.width * plot.LABEL_SHARE)
         boxes = [entities.overlay(tile.camera, "boxes"), *(entities.layer(camera, name) for name in _layers(frame))]
         draw_strips(part, frame, entities.overlay(tile.camera, entities.IMAGE_BOXES), np.asarray)
         for entity in boxes:
@@ -222,7 +224,7 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     scale = np.array([tile.width / width, tile.height / height])
 
     def to_canvas(points: Array) -> Array:
-        return np.clip(points * scale, -drawing.FAR, drawing.FAR)
+        return np.clip(points * scale, -plot.FAR, plot.FAR)
 
     boxes = entities.overlay(tile.camera, "boxes")
     for line_kind in entities.line_kinds(frame.rows):
@@ -233,13 +235,13 @@ def _draw_camera(canvas: Canvas, frame: RecordedFrame, tile: Tile, image: Canvas
     for entity in (boxes, *layers):
         draw_strips(canvas, frame, entity, to_canvas)
     for entity in (boxes, *layers):
-        draw_labels(canvas, frame, f"{entity}/labels", to_canvas, drawing.SMALL_TEXT)
-    drawing.draw_title(canvas, tile.camera, has_image=image is not None)
+        draw_labels(canvas, frame, f"{entity}/labels", to_canvas, plot.SMALL_TEXT)
+    plot.draw_title(canvas, tile.camera, has_image=image is not None)
 
 
 def _draw_bev(canvas: Canvas, frame: RecordedFrame) -> None:
     rings = max((np.abs(ring).max(initial=0) for ring in frame.strips(entities.BEV_RINGS, STRIPS)), default=0)
-    to_canvas = drawing.from_above(drawing.BEV_MARGIN * rings or BEV_RANGE_M)
+    to_canvas = plot.from_above(plot.BEV_MARGIN * rings or BEV_RANGE_M)
 
     segmentation = recorded_image(frame, entities.BEV_SEGMENTATION)
     if segmentation is not None:
@@ -261,7 +263,7 @@ def _draw_placed(canvas: Canvas, frame: RecordedFrame, entity: str, image: Canva
     extent = frame.array(entity, "Transform3D:scale", 3, 1)[0, :2] * image.shape[1::-1]
     left, top = to_canvas(start).astype(int)
     right, bottom = to_canvas(start + extent).astype(int)
-    x0, y0, x1, y1 = max(left, 0), max(top, 0), min(right, drawing.BEV_SIDE), min(bottom, drawing.BEV_SIDE)
+    x0, y0, x1, y1 = max(left, 0), max(top, 0), min(right, plot.BEV_SIDE), min(bottom, plot.BEV_SIDE)
     rows = (np.arange(y0, y1) - top) * image.shape[0] // max(1, bottom - top)
     columns = (np.arange(x0, x1) - left) * image.shape[1] // max(1, right - left)
     canvas[y0:y1, x0:x1] = image[rows[:, None], columns]
@@ -271,25 +273,25 @@ def _draw_legend(canvas: Canvas, frame: RecordedFrame) -> None:
     title = "".join(frame.texts(entities.RUN, "title"))
     scene = "".join(frame.texts(entities.EGO, "scene"))
     speed = "".join(frame.texts(entities.SPEED, "Points3D:labels"))
-    drawing.draw_text(canvas, f"{title}   {scene}   frame {frame.index}   {speed}", (16, 24), drawing.TEXT, 0.6)
+    plot.draw_text(canvas, f"{title}   {scene}   frame {frame.index}   {speed}", (16, 24), plot.TEXT, 0.6)
     note = "".join(frame.texts(entities.RUN, "note"))
     if any(frame.integers(entities.RUN, "untrained")):
-        note = drawing.UNTRAINED
-    drawing.draw_text(canvas, note, (drawing.CAMERAS_WIDTH - 480, 24), drawing.WARNING, 0.6)
+        note = plot.UNTRAINED
+    plot.draw_text(canvas, note, (plot.CAMERAS_WIDTH - 480, 24), plot.WARNING, 0.6)
     counts, layers = Counter(frame.texts(entities.BOXES, "name")), _layers(frame)
     for name in layers:
         counts[name] = len(frame.texts(entities.layer(entities.WORLD, name), "name"))
     for index, (name, color) in enumerate((layers or _class_colors(frame)).items()):
         position = 16 + 250 * (index % 5), 60 + 32 * (index // 5)
-        drawing.draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
+        plot.draw_entry(canvas, position, color, f"{name.replace('_', ' ')} {counts[name]}")
     for index, (name, color) in enumerate(_named_colors(frame, "line_names", "line_colors").items()):
-        drawing.draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
+        plot.draw_entry(canvas, (16 + 250 * index, 60 + 32 * 2), color, name)
     if frame.has(entities.BEV_SEGMENTATION, "Image:buffer"):
         # Recordings of version 0.1.0 do not name their classes, which are those of the segmentation head.
         classes = frame.texts(entities.RUN, "map_classes") or list(MAP_CLASSES)
-        width = min(250, (drawing.CAMERAS_WIDTH - 16) // len(classes))
+        width = min(250, (plot.CAMERAS_WIDTH - 16) // len(classes))
         for index, (name, color) in enumerate(map_colors(classes).items()):
-            drawing.draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
+            plot.draw_entry(canvas, (16 + width * index, 60 + 32 * 2), color, f"map: {name.replace('_', ' ')}")
 
 
 def _layers(frame: RecordedFrame) -> dict[str, Color]:

@@ -21,8 +21,9 @@ from bevcli.geometry.boxes import Boxes3D, attributes_by_speed
 from bevcli.geometry.cameras import Camera, default_ego_from_bev
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z, yaw_of_quaternion
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, read_boxes
 from bevcli.sequences.files.boxes_table import write_csv
+from bevcli.workshop.formats.convert import write_boxes
 from bevcli.workshop.formats.kitti import kitti_labels, write_kitti
 from bevcli.workshop.formats.nuscenes_output import SubmissionWriter, is_submission, read_submission, write_submission
 

@@ -14,8 +14,9 @@ from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, CameraRig, Distortion
 from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.inference.image_repair import auto_levels, defogged, denoised, measure_noise
 from bevcli.inference.preprocess import Preprocessor, image_for_rig, pixel_weights, resize_and_normalize
-from bevcli.model.step import assign_cameras, joined_inputs, model_inputs
+from bevcli.model.step import assign_cameras, model_inputs
 from bevcli.workshop.synth import corruptions
+from bevcli.workshop.training.samples import joined_inputs
 
 
 def textbook_image(pixels, image):

@@ -16,8 +16,9 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import rigid
 from bevcli.recording import RecordingOptions, entities
 from bevcli.recording.log_static import Recorded, RecordedBoxes, legend_entries
-from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes, write_boxes
-from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, read_recording, summarise
+from bevcli.sequences.files.boxes_file import BoxesFile, FrameBoxes
+from bevcli.viewer.recording_reader import RecordedFrame, RecordingReader, summarise
+from bevcli.workshop.formats.convert import read_recording, write_boxes
 from bevcli.workshop.formats.nuscenes_output import write_submission
 from bevcli.workshop.scores.record import names_of, record, record_steps
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles

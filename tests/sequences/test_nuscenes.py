@@ -12,9 +12,10 @@ import pytest
 from nuscenes_tables import CAMERAS, SAMPLE_US, Size, ego_x, sample_time, scene_name, write_tables
 
 from bevcli.errors import InputError
-from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json, write_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, boxes_from_json, boxes_to_json
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.formats import NuScenesOptions, nuscenes_tables as tables
+from bevcli.workshop.formats.convert import write_boxes
 from bevcli.workshop.formats.nuscenes import NuScenesDrive, read_can_bus
 from bevcli.workshop.formats.nuscenes_index import MINI_VAL, NUSCENES, TEST, VAL, numbers, split_of
 from bevcli.workshop.formats.nuscenes_tables import build_index

@@ -20,7 +20,8 @@ from bevcli.recording.writer import Recording
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.viewer import ViewOptions, recording_file
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import RecordingReader, read_recording, recorded_boxes, summarise
+from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes, summarise
+from bevcli.workshop.formats.convert import read_recording
 from bevcli.workshop.video import RecordedImages, draw_frame, tiles
 
 

@@ -21,7 +21,7 @@ from bevcli.model import segmentation, upload
 from bevcli.model.deformable_attention import FeatureMaps
 from bevcli.model.image_tokens import CalibrationEmbedding, ImageTokens
 from bevcli.model.kernels import rounded_products
-from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, change_classes, has_triton, triton_kernels
+from bevcli.model.kernels.choose import KeptCalibrationEmbedding, LastCall, has_triton, triton_kernels
 from bevcli.model.kernels.compiled import in_threads
 from bevcli.model.pillar_projection import MIN_DEPTH, PillarHits, Pillars
 from bevcli.model.resnet import Bottleneck, ResNet
@@ -153,13 +153,6 @@ class PillarsOfCpu(Pillars):
         """As `Pillars.forward`; the hits are on the device."""
         hits = hits_on_cpu(image_from_bev, self.points_on_cpu, image_size, has_image)
         return upload.upload_together(hits, self.points.device)
-
-
-def find_hits_on_cpu(network: nn.Module, device: torch.device) -> None:
-    """Lets the CPU find the hits of a network that is trained on a GPU, in place. Nothing changes on a CPU."""
-    for module in network.modules() if device.type != "cpu" else ():
-        if type(module) is Pillars:
-            change_classes(module, {Pillars: PillarsOfCpu}, points_on_cpu=module.points.cpu())
 
 
 class PaddedPillars(PillarsOfCpu):

@@ -24,7 +24,6 @@ from bevcli.parsing.documents import TOML_BYTES, parse_toml, typed, without_garb
 from bevcli.parsing.files import read_text
 from bevcli.sequences.files.incremental_json import IncrementalJson, read_frames, stamp_from_json, stamp_to_json
 from bevcli.sequences.files.json_fields import pose_from_json, pose_to_json
-from bevcli.writing import whole_file
 
 FUTURE_DECIMALS = 3  # millimetres
 _Mode = Annotated[list[tuple[float, float] | None], Meta(min_length=1)]
@@ -373,15 +372,6 @@ class BoxesWriter(IncrementalJson):
             row["world_from_ego"] = pose_to_json(frame.world_from_ego)
         row["boxes"] = boxes_to_json(frame.boxes)
         self.add(row, f"frame {frame.stamp.index}")
-
-
-def write_boxes(boxes: BoxesFile, path: Path) -> int:
-    """Write all frames of a file; return the number of boxes. Raises OutputError."""
-    facts = boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev
-    with whole_file(path) as unfinished, BoxesWriter(unfinished, *facts) as writer:
-        for frame in boxes.frames:
-            writer.write(frame)
-    return sum(len(frame.boxes) for frame in boxes.frames)
 
 
 def _frame(path: Path, index: int, row: Any, frame_of_reference: str, class_names: ClassNames) -> FrameBoxes:

@@ -45,12 +45,6 @@ LONGEST_NAME = 60  # characters of a wrong name in a message
 LARGEST_SIZE = 16384  # pixels of a side
 FOCAL_RANGE = (0.05, 50.0)  # focal length divided by image size, from extreme fisheye to extreme telephoto
 ORIGIN_LIMITS = {"latitude": 90.0, "longitude": 180.0, "heading_deg": 360.0}  # in the order of GeoOrigin's fields
-# Names of ROS, Kalibr and OpenCV.
-LENS_NAMES = {
-    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "radial_tangential"), "brown_conrady"),
-    **dict.fromkeys(("brown_conrady", "opencv"), "brown_conrady"),
-    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "opencv_fisheye"), "kannala_brandt"),
-}
 COEFFICIENT_COUNTS = {"brown_conrady": (4, 5, 8), "kannala_brandt": (4,)}
 
 

@@ -13,19 +13,20 @@ from bevcli.frame import Drive, Frame
 from bevcli.geometry.boxes import IMPOSSIBLE
 from bevcli.options import gather, spread
 from bevcli.printing import counted
-from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes, write_boxes
+from bevcli.recording import entities
+from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, above_score, read_boxes
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
 from bevcli.sequences.options import InputOptions
 from bevcli.viewer.recording_file import open_recording
-from bevcli.viewer.recording_reader import read_recording
+from bevcli.viewer.recording_reader import RecordingReader, recorded_boxes
 from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
 from bevcli.workshop.formats.kitti import export_kitti
 from bevcli.workshop.formats.labels import WithLabels
 from bevcli.workshop.formats.nuscenes_output import NuScenesWriter, write_submission
 from bevcli.workshop.formats.output import DriveWriter, NativeWriter
-from bevcli.writing import check_output
+from bevcli.writing import check_output, whole_file
 
 NAMES = {"mcap": "an MCAP file", "native": "a sequence folder", "nuscenes": "a nuScenes root"}
 # Format -> the name of the file or folder that is written next to the boxes by default.
@@ -175,6 +176,20 @@ def _boxes_of(file: Path) -> tuple[BoxesFile, str]:
         return read_recording(whole), note
 
 
+def read_recording(recording: Path) -> BoxesFile:
+    """The shown boxes of all frames, in the world frame. Raises InputError for a recording without frames."""
+    frames = list[FrameBoxes]()
+    for frame in RecordingReader(recording).frames():
+        if names := frame.texts(entities.RUN, "layer_names"):
+            raise InputError(
+                f"{recording}: compares {' and '.join(names)} (expected boxes of one model): use their files"
+            )
+        frames.append(recorded_boxes(frame))
+    if not frames:
+        raise InputError(f"{recording}: the recording has no frames with boxes (expected one of `bevcli run`)")
+    return BoxesFile("world", tuple(frames))
+
+
 def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path) -> str:
     """Write boxes of a file, and say what, such as "20 frames, 3 tracks"."""
     if options.form == "kitti":
@@ -182,3 +197,12 @@ def _write(boxes: BoxesFile, target: Path, options: ExportOptions, source: Path)
     if options.form in ("csv", "json"):
         return counted((write_csv if options.form == "csv" else write_boxes)(boxes, target), "boxes")
     return counted(write_submission(boxes, target, tracking=options.form == "nuscenes-tracking"), "samples")
+
+
+def write_boxes(boxes: BoxesFile, path: Path) -> int:
+    """Write all frames of a file; return the number of boxes. Raises OutputError."""
+    facts = boxes.frame_of_reference, boxes.extras, boxes.ego_from_bev
+    with whole_file(path) as unfinished, BoxesWriter(unfinished, *facts) as writer:
+        for frame in boxes.frames:
+            writer.write(frame)
+    return sum(len(frame.boxes) for frame in boxes.frames)

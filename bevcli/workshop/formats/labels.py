@@ -17,7 +17,7 @@ import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.frame import DerivedDrive, Drive, Frame, FrameStamp
-from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D, velocities_between
+from bevcli.geometry.boxes import IMPOSSIBLE, Boxes3D
 from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CsvRow
@@ -37,6 +37,7 @@ from bevcli.workshop.formats.label_readings import (
     decided,
     fitting,
 )
+from bevcli.workshop.formats.nuscenes_tables import velocities_between
 
 NEAREST_NS = 50_000_000  # largest difference between the time of a frame and of its labels
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +21,7 @@ from bevcli.parsing.documents import CSV_BYTES
 from bevcli.parsing.files import IMAGE_SUFFIXES, MIB, VIDEO_SUFFIXES, is_there, read_bytes, read_text
 from bevcli.parsing.images import size_of_image
 from bevcli.printing import counted, name_of
-from bevcli.sequences.images import FrameEntry, Source, size_of_video
+from bevcli.sequences.images import FrameEntry, Source, open_capture
 from bevcli.workshop.formats.camera_names import folder_of_images, match_names
 
 FARTHEST = 0.501  # of a camera's period: an image farther from the frame than half of it belongs to another frame
@@ -172,3 +173,11 @@ def size_of_first(drive: Path | None, camera: str) -> tuple[int, int] | None:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return size_of_video(path)
     return size_of_image(read_bytes(path, LARGEST_IMAGE))
+
+
+def size_of_video(path: Path) -> tuple[int, int]:
+    """(width, height) of the images of a video, pixels. Raises InputError as `open_capture`."""
+    capture = open_capture(path)
+    width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    capture.release()
+    return width, height

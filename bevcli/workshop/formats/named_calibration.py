@@ -18,7 +18,7 @@ from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array, rigid, rotation_from_quaternion
 from bevcli.parsing.documents import first_twice, read_json
 from bevcli.parsing.files import read_bytes
-from bevcli.sequences.files.calibration_file import LARGEST_BYTES, LENS_NAMES
+from bevcli.sequences.files.calibration_file import LARGEST_BYTES
 from bevcli.sequences.files.json_fields import array_of_numbers, parse_numbers, parse_transform, require
 from bevcli.workshop.formats.camera_poses import Cameras, Direction, Fields, StatedCamera, StatedPose
 from bevcli.workshop.formats.dialects import PROJECTIONS, urdf_document, with_intrinsics_by_name, with_own_names
@@ -33,6 +33,12 @@ INTRINSICS = ("intrinsics", "intrinsic", "k", "cameramatrix", "intrinsicmatrix",
 LENS = ("distortion", "d", "dist", "distcoeffs", "distortioncoefficients", "distortioncoeffs", "distcoeff",
         "distortionparameters")  # fmt: skip
 LENS_MODEL = ("distortionmodel", "lensmodel", "distortiontype")
+# Names of ROS, Kalibr and OpenCV.
+LENS_NAMES = {
+    **dict.fromkeys(("plumb_bob", "rational_polynomial", "radtan", "radial_tangential"), "brown_conrady"),
+    **dict.fromkeys(("brown_conrady", "opencv"), "brown_conrady"),
+    **dict.fromkeys(("equidistant", "fisheye", "kannala_brandt", "opencv_fisheye"), "kannala_brandt"),
+}
 WIDTH, HEIGHT = ("width", "imagewidth", "w"), ("height", "imageheight", "h")
 SIZE = ("resolution", "imagesize", "size")
 FOCAL = ("f", "focallength")

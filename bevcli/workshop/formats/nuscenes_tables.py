@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.boxes import velocities_between
 from bevcli.geometry.ego_motion import nearest
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import LARGEST_INTEGER, parse_json, without_garbage_collection
@@ -46,6 +45,7 @@ BATCH_BYTES = 16 << 20
 LONGEST_TEXT = 400  # characters of a token, name or path
 LARGEST_NUMBER = 1e12  # metres or pixels
 SHORTEST_QUATERNION = 1e-3
+MAX_GAP_S = 1.5  # longest time between two annotations of an object from which a velocity is derived
 # The text between two rows. Rows of large tables contain no objects and no free text, so it occurs nowhere else.
 BETWEEN_ROWS = re.compile(rb"}\s*,\s*{")
 TAIL_BYTES = 1 << 14  # the end of a batch in which its last complete row ends; no row is longer
@@ -334,6 +334,23 @@ def _read_annotations(
     columns["velocities"] = velocities_between(columns["centers"], seconds, first, last)[:, :2]
     order = np.argsort(samples, kind="stable")
     return Annotations(**_rows(columns, order)), _starts(samples[order], len(sample_tokens))
+
+
+def velocities_between(centers: Array, times_s: Array, first: Ints, last: Ints) -> Array:
+    """(A, 3) m/s, NaN if unknown: central differences, one-sided for an object's first and last annotation.
+
+    As in the official nuScenes devkit, a velocity is known if each time gap is at most 1.5 s on average.
+
+    centers: (A, 3) metres, world frame. times_s: (A,) seconds. first, last: (A,) rows of the annotations of the same
+    object before and after; the own row where there is none.
+    """
+    rows = np.arange(len(centers))
+    seconds = times_s[last] - times_s[first]
+    longest = MAX_GAP_S * ((first != rows).astype(int) + (last != rows))
+    is_short = (seconds > 0) & (seconds <= longest)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        velocities: Array = (centers[last] - centers[first]) / seconds[:, None]
+    return np.where(is_short[:, None], velocities, np.nan)
 
 
 def _linked(linked: NDArray[np.bytes_], tokens: NDArray[np.bytes_], path: Path) -> Ints:

@@ -18,7 +18,7 @@ from bevcli.errors import InputError
 from bevcli.parsing.files import MIB, open_regular
 from bevcli.printing import counted
 from bevcli.sequences.files.calibration_file import draft_of
-from bevcli.sequences.images import ImageSource, count_and_rate, open_capture
+from bevcli.sequences.images import ImageSource, open_capture
 from bevcli.sequences.native import FolderOptions
 from bevcli.sequences.native.folder import FolderDrive
 from bevcli.sequences.options import InputOptions
@@ -34,6 +34,7 @@ EBML, RIFF = b"\x1a\x45\xdf\xa3", b"RIFF"  # first bytes of MKV and WebM, and of
 # Elements of Matroska: those that contain others, and those that are read.
 CONTAINERS = {0x18538067, 0x1549A966, 0x1654AE6B, 0xAE, 0x1F43B675, 0xA0}
 SCALE, TRACK, TRACK_TYPE, CLUSTER_TIME, BLOCKS = 0x2AD7B1, 0xD7, 0x83, 0xE7, (0xA3, 0xA1)
+SMALLEST_IMAGE = 8  # bytes of a container for each of its images, at least
 VIDEO = 1  # the type of a track
 Box = tuple[bytes, int, int]  # of MP4: kind, and where its contents begin and end
 
@@ -80,6 +81,16 @@ def video_images(path: Path, start_ns: int = 0, rate_hz: float | None = None) ->
         times, period = stated, float(np.median(np.diff(stated)))
     times = start_ns + times
     return CameraImages(path.name, times, period, lambda index: ImageSource(path, int(times[index]), index), is_uneven)
+
+
+def count_and_rate(path: Path) -> tuple[int, float]:
+    """Number of images and images per second, as the container states them. Raises InputError where it does not."""
+    capture = open_capture(path)
+    count, rate = float(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+    capture.release()
+    if not 0 < count <= path.stat().st_size / SMALLEST_IMAGE or not 0.001 < rate < 10_000:
+        raise InputError(f"{path} states {count:.0f} images at {rate:g} per second: list its images in frames.csv")
+    return int(count), rate
 
 
 def container_times_ns(path: Path) -> Times | None:

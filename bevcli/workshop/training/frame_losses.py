@@ -28,7 +28,6 @@ from bevcli.geometry.boxes import BOX_EDGES
 from bevcli.inference.load import weights_file
 from bevcli.model.config import ModelConfig
 from bevcli.model.kernels.choose import choose_kernels
-from bevcli.model.kernels.gpu import find_hits_on_cpu
 from bevcli.model.network import Network, build_network
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.step import ModelInputs, ModelOutputs
@@ -36,6 +35,7 @@ from bevcli.model.upload import upload
 from bevcli.parsing.documents import CountOrNone, NotNegative
 from bevcli.workshop.training import losses
 from bevcli.workshop.training.augmentation import renormalised
+from bevcli.workshop.training.kernels import find_hits_on_cpu
 from bevcli.workshop.training.samples import Batch
 from bevcli.workshop.training.targets import PaddedTargets, Targets
 

@@ -16,8 +16,9 @@ from bevcli.model.deformable_attention import DeformableAttention, GridSampling
 from bevcli.model.deformable_convolution import ModulatedDeformableConvolution
 from bevcli.model.kernels.choose import change_classes, has_triton, triton_kernels
 from bevcli.model.kernels.compiled import CompiledSampling, as_array, in_threads
-from bevcli.model.kernels.gpu import find_hits_on_cpu
+from bevcli.model.kernels.gpu import PillarsOfCpu
 from bevcli.model.network import Network
+from bevcli.model.pillar_projection import Pillars
 
 
 def choose_training_kernels(model: nn.Module, device: torch.device) -> None:
@@ -35,6 +36,13 @@ def choose_training_kernels(model: nn.Module, device: torch.device) -> None:
         if isinstance(module, DeformableAttention):
             module.sampling = sampling()
     find_hits_on_cpu(model, device)
+
+
+def find_hits_on_cpu(network: nn.Module, device: torch.device) -> None:
+    """Lets the CPU find the hits of a network that is trained on a GPU, in place. Nothing changes on a CPU."""
+    for module in network.modules() if device.type != "cpu" else ():
+        if type(module) is Pillars:
+            change_classes(module, {Pillars: PillarsOfCpu}, points_on_cpu=module.points.cpu())
 
 
 class LearnedSampling(GridSampling):
