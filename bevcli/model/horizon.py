@@ -12,8 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.lift import inverse_of_two
-from bevcli.model.road_slopes import SPREAD, RoadSlopes
+from bevcli.model.road_slopes import SPREAD, RoadSlopes, inverse_of_two
 
 ROWS, COLUMNS, STEP_DEG = 112, 1440, 0.25  # of the ring, and between two of either
 FOLD = 8  # columns of the ring to a direction of the network
@@ -63,11 +62,11 @@ class Horizon(nn.Module):
         self.ring = Ring()
         layers: list[nn.Module] = []
         rows, channels = ROWS, 2
-        for outputs, size, stride in ((24, 5, 2), (48, 3, 2), (64, 3, 2), (64, 3, 1), (64, 3, 1)):
+        for outputs, size, stride in ((16, 5, 2), (32, 3, 2), (48, 3, 2), (48, 3, 1)):
             layers += [Around(size), nn.Conv2d(channels, outputs, size, stride, padding=(size // 2, 0)), nn.ReLU()]
             rows, channels = rows // stride, outputs
-        layers += [Around(3), nn.Conv2d(channels, 128, (rows, 3)), nn.ReLU()]
-        layers += [nn.Conv2d(128, 64, 1), nn.ReLU(), nn.Conv2d(64, 4, 1)]
+        layers += [Around(3), nn.Conv2d(channels, 96, (rows, 3)), nn.ReLU()]
+        layers += [nn.Conv2d(96, 64, 1), nn.ReLU(), nn.Conv2d(64, 4, 1)]
         self.network = nn.Sequential(*layers)
         nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]
         nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]

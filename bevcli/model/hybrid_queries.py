@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.bev_grid import BevGrid
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, rows
-from bevcli.model.lift import NO_BOX, Lift, LiftConfig, inverse_of_two
+from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 from bevcli.model.pillar_projection import project_points
 from bevcli.model.road_slopes import RoadSlopes, levelled
 from bevcli.model.upload import upload_together
@@ -34,7 +34,6 @@ EXPECTED, PRIOR = 0.2, 3.0  # share that is explained before anything was seen, 
 TRUSTED = 0.28, 0.38  # share of explained boxes, from no to full trust in the learned queries
 DOUBT, YIELD = 2.0, 3.0  # taken from the logits of learned queries without trust, and of hybrid ones with full trust
 NEAREST_M = 0.3  # of the corners of a box that a camera sees
-LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
 
 
 @dataclass(frozen=True)
@@ -94,18 +93,12 @@ class HybridQueries(nn.Module):
     ) -> tuple[Tensor, RoadSlopes]:
         """(B, N, 4, 4), see `levelled`, and the slopes of the road; on the CPU.
 
-        The frame is turned the less, the less sure the slope is. Arguments: see `forward`; all but the boxes are on the
-        CPU.
+        Arguments: see `forward`; all but the boxes are on the CPU.
         """
         cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
         told = self.lift(boxes, *cameras)[-1]
-        numbers = torch.cat([told.mean[..., None], told.covariance], -1).to(image_from_bev.device)  # one copy
-        told = RoadSlopes(numbers[..., 0], numbers[..., 1:])
-        slopes, covariance = told.mean, told.covariance
-        information = inverse_of_two(covariance)
-        sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
-        slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
-        return levelled(image_from_bev, slopes, -self.lift.ground_z), told
+        told = told.to(image_from_bev.device)
+        return levelled(image_from_bev, told, -self.lift.ground_z), told
 
     def weighed(
         self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]

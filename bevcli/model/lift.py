@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
-from bevcli.model.road_slopes import SPREAD, RoadSlopes, adjugate_of_three
+from bevcli.model.road_slopes import SPREAD, RoadSlopes, adjugate_of_three, inverse_of_two
 
 NAMES = {"person": "pedestrian"}  # names of classes that are other ones in images
 # Of each image class: mean width, length and height of its objects, metres.
@@ -140,15 +140,6 @@ class Lift(nn.Module):
             products, pull = products + information, pull + (information * expected.mean[:, None]).sum(-1)
         covariance = inverse_of_two(products)
         return RoadSlopes((covariance * pull[:, None]).sum(-1), covariance)
-
-
-def inverse_of_two(matrices: Tensor) -> Tensor:
-    """Of symmetric matrices (..., 2, 2), by operations that exported files have; 0 for 0."""
-    (xx, xy), (_, yy) = (row.unbind(-1) for row in matrices.unbind(-2))
-    return (
-        torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2))
-        / (xx * yy - xy * xy).clamp(min=1e-20)[..., None, None]
-    )
 
 
 class Rays:

@@ -93,10 +93,13 @@ class Network(TemporalModel):
         return self.image_detector.image_boxes(self.image_detector(images.flatten(0, 1)), has_image, image_sizes)
 
     @on_device
-    def find_slopes(self, images: Tensor, image_from_bev: Tensor) -> Tensor:
-        """(B, 2) the slopes of the road that the horizon tells. Arguments: see `ModelInputs`."""
+    def find_slopes(self, images: Tensor, image_from_bev: Tensor) -> RoadSlopes:
+        """The slopes of the road that the horizon tells. Arguments: see `ModelInputs`."""
+        images, image_from_bev = upload_together((images, image_from_bev), self.device)
         assert self.horizon is not None
-        return self.horizon(*upload_together((images, image_from_bev), self.device)).mean
+        with without_autocast(self.device):  # half precision is too coarse for the ring
+            slopes: RoadSlopes = self.horizon(images, image_from_bev)
+        return slopes
 
     def look(
         self,

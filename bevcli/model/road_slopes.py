@@ -31,6 +31,7 @@ SCALE = 0.7  # of residuals, pixels: those far beyond are of what moves by itsel
 FEWEST, AGREE = 30, 0.6  # points; share of them within two scales. With less the poses are not of these images
 STANDS_M = 0.05  # a shorter way shows no direction
 STEPS, DIFFERENCE = 6, 1e-6
+LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,11 @@ class RoadSlopes:
     def unknown(cls) -> "RoadSlopes":
         """Where nothing was measured."""
         return cls(torch.zeros(1, 2), SPREAD**2 * torch.eye(2)[None])
+
+    def to(self, device: torch.device) -> "RoadSlopes":
+        """On a device, by one copy."""
+        numbers = torch.cat([self.mean[..., None], self.covariance], -1).to(device)
+        return RoadSlopes(numbers[..., 0], numbers[..., 1:])
 
     @classmethod
     def of_names(cls, tensors: Mapping[str, Tensor]) -> "RoadSlopes | None":
@@ -168,11 +174,16 @@ def level_from_bev(along_x: Any, along_y: Any) -> Any:
     return (x, 0 * x, x * along_x), left, (-z * along_x, -z * along_y, z)
 
 
-def levelled(image_from_bev: Tensor, slopes: Tensor, height_m: float) -> Tensor:
+def levelled(image_from_bev: Tensor, told: RoadSlopes, height_m: float) -> Tensor:
     """(B, N, 4, 4), pixels from a bev frame that is level with the road, turned about the point of the road below it.
 
-    image_from_bev: (B, N, 4, 4). slopes: (B, 2), on the same device. height_m: of the bev frame above the road.
+    It is turned the less, the less sure the slopes are.
+
+    image_from_bev: (B, N, 4, 4). told: on the same device. height_m: of the bev frame above the road.
     """
+    slopes, information = told.mean, inverse_of_two(told.covariance)
+    sureness = ((information * slopes[:, None]).sum(-1) * slopes).sum(-1)  # in squares of standard deviations
+    slopes = slopes * (1 - LEVEL_FROM / sureness.clamp(min=LEVEL_FROM))[:, None]
     axes = [torch.stack(axis, -1) for axis in level_from_bev(*slopes.unbind(-1))]  # of the level frame
     bev_from_level = torch.eye(4, device=slopes.device).repeat(len(slopes), 1, 1)
     bev_from_level[:, :3, :3] = torch.stack(axes, -1)
@@ -227,6 +238,15 @@ def upright_images(images: Tensor, image_from_upright: Tensor, sizes: Tensor, si
     turned = F.grid_sample(images, places, mode="bicubic", padding_mode="border", align_corners=False)
     is_image = (pixels[..., :2] < edge[:, None] - 0.5).all(-1)  # (B·N, h, w)
     return turned * is_image[:, None]
+
+
+def inverse_of_two(matrices: Tensor) -> Tensor:
+    """Of symmetric matrices (..., 2, 2), by operations that exported files have; 0 for 0."""
+    (xx, xy), (_, yy) = (row.unbind(-1) for row in matrices.unbind(-2))
+    return (
+        torch.stack([yy, -xy, -xy, xx], -1).unflatten(-1, (2, 2))
+        / (xx * yy - xy * xy).clamp(min=1e-20)[..., None, None]
+    )
 
 
 def inverse_of_three(matrices: Tensor) -> Tensor:

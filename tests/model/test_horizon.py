@@ -14,7 +14,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.horizon import COLUMNS, FOLD, ROWS, STEP_DEG, Horizon
 from bevcli.model.hybrid_queries import HybridQueriesConfig
 from bevcli.model.nanodet import NanoDetConfig
-from bevcli.model.road_slopes import levelled
+from bevcli.model.road_slopes import RoadSlopes, levelled
 
 SIZE = 120, 200  # height and width
 
@@ -65,7 +65,10 @@ def test_the_slopes_fit_what_all_directions_tell():
 def test_a_level_rig_sees_the_road_level():
     """A point of the road lies at the same pixel, by the rig as it is and, level, by the one that is levelled."""
     rig, slopes = torch.from_numpy(looking(30))[None, None], torch.tensor([[0.03, -0.02]], dtype=torch.float64)
-    level = levelled(rig.float(), slopes.float(), 1.5).double()
+    told = RoadSlopes(slopes.float(), 1e-9 * torch.eye(2)[None])
+    level = levelled(rig.float(), told, 1.5).double()
+    unsure = RoadSlopes(told.mean, torch.eye(2)[None])
+    np.testing.assert_array_equal(levelled(rig.float(), unsure, 1.5), rig.float())
     (x, y), (along_x, along_y) = (10.0, 4.0), slopes[0].tolist()
     pixel = rig[0, 0] @ torch.tensor([x, y, along_x * x + along_y * y - 1.5, 1.0], dtype=torch.float64)
     point = torch.linalg.solve(level[0, 0], torch.cat([pixel[:3], torch.ones(1)]))
@@ -84,8 +87,8 @@ def test_demo_sees_by_how_much_its_vehicle_is_tilted(pitch_deg, roll_deg):
         frame = drive.load(index)
         cameras = [replace(x, ego_from_camera=tilt @ x.ego_from_camera) for x in frame.rig.cameras]
         prepared = Preprocessor(model.config, threads=1)(replace(frame, rig=replace(frame.rig, cameras=tuple(cameras))))
-        found = model.network.find_slopes(prepared.images, prepared.image_from_bev.float())[0].numpy()
-        normal = tilt[:3, :3] @ [0.0, 0.0, 1.0]
+        found = model.network.find_slopes(prepared.images, prepared.image_from_bev.float()).mean[0].numpy()
+        normal = prepared.frame.rig.ego_from_bev[:3, :3].T @ tilt[:3, :3] @ [0.0, 0.0, 1.0]
         errors.append(np.degrees(found + normal[:2] / normal[2]))
     assert np.abs(errors).mean() < 0.3
 

@@ -1,10 +1,11 @@
 """Trains the horizon of the model demo (`bevcli.model.horizon`) on rendered drives.
 
-    python tests/tools/horizon.py OUT [--drives 30000:30160] [--seconds 2400] [--seed 0]
+    python tests/tools/horizon.py OUT [--drives 30000:30160] [--seconds 1200] [--weights FILE] [--seed 0]
 
 1. Drives with random rigs, varied looks and bodies that move are rendered into OUT/drives, and the rings of their
    frames kept in OUT/rings/SEED.pt, with the slopes that their poses tell, unless these do not. What is there is used.
-2. The network learns from these rings, turned as if the vehicle had pitched and rolled further.
+2. The network learns from these rings, turned as if the vehicle had pitched and rolled further; from random weights,
+   or on from those that it wrote before, at a quarter of the rate.
 
 Weights: OUT/horizon.safetensors, with the keys that they have in the model's file. The last drives are held out; how
 far off it is on them is printed. One thread takes 6 s for a drive, and 0.3 s for an update.
@@ -49,7 +50,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Train the horizon of the model demo on rendered drives.")
     parser.add_argument("out", type=Path)
     parser.add_argument("--drives", type=parse_seeds, default=parse_seeds("30000:30160"))
-    parser.add_argument("--seconds", type=float, default=2400.0)
+    parser.add_argument("--seconds", type=float, default=1200.0)
+    parser.add_argument("--weights", type=Path, help="to go on from, such as OUT/horizon.safetensors")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     (asked.out / "rings").mkdir(parents=True, exist_ok=True)
@@ -57,7 +59,8 @@ def main() -> int:
     stated = [seed for seed in asked.drives if draw_rig(RIGS, seed, size).body != "unstated"]
     rings = [kept_rings(seed, asked.out) for seed in stated]
     held = joined(rings[-HELD_OUT:])
-    horizon = train(joined(rings[:-HELD_OUT]), held, asked.seconds, asked.seed)
+    begun = {} if asked.weights is None else safetensors.torch.load_file(asked.weights)
+    horizon = train(joined(rings[:-HELD_OUT]), held, asked.seconds, asked.seed, begun)
     state = {f"horizon.{key}": value.half() for key, value in horizon.state_dict().items()}
     safetensors.torch.save_file(state, asked.out / "horizon.safetensors")
     return 0
@@ -140,20 +143,25 @@ def changed(rings: Tensor, cameras: Tensor, random: torch.Generator) -> tuple[Te
     return changed, ((cameras != 255) & (black | ~lost)).float()
 
 
-def train(data: dict[str, Tensor], held: dict[str, Tensor], seconds: float, seed: int) -> Horizon:
-    """The horizon after so many seconds."""
+def train(
+    data: dict[str, Tensor], held: dict[str, Tensor], seconds: float, seed: int, begun: dict[str, Tensor]
+) -> Horizon:
+    """The horizon after so many seconds. begun: weights to go on from, empty for random ones."""
     torch.manual_seed(seed)
-    random, horizon = torch.Generator().manual_seed(seed), Horizon()
-    plain = list(horizon.network)
-    norms = [[x, nn.BatchNorm2d(x.out_channels)] if isinstance(x, nn.Conv2d) else [x] for x in plain[:-1]]
-    horizon.network = nn.Sequential(*(module for pair in norms for module in pair), plain[-1])
+    random, horizon, rate = torch.Generator().manual_seed(seed), Horizon(), RATE / 4 if begun else RATE
+    if begun:
+        horizon.load_state_dict({key.removeprefix("horizon."): value.float() for key, value in begun.items()})
+    else:
+        plain = list(horizon.network)
+        norms = [[x, nn.BatchNorm2d(x.out_channels)] if isinstance(x, nn.Conv2d) else [x] for x in plain[:-1]]
+        horizon.network = nn.Sequential(*(module for pair in norms for module in pair), plain[-1])
     horizon.requires_grad_(True)
     optimizer = torch.optim.AdamW(horizon.parameters(), weight_decay=0.02)
-    begun, updates, said = time.perf_counter(), 0, 0.0
+    start, updates, said = time.perf_counter(), 0, 0.0
     largest = torch.deg2rad(torch.tensor([PITCH_DEG, ROLL_DEG]))
-    while (done := (time.perf_counter() - begun) / seconds) < 1:
+    while (done := (time.perf_counter() - start) / seconds) < 1:
         for group in optimizer.param_groups:
-            group["lr"] = RATE * min(1.0, 0.05 + updates / 50) * (0.01 + 0.99 * (1 + math.cos(math.pi * done)) / 2)
+            group["lr"] = rate * min(1.0, 0.05 + updates / 50) * (0.01 + 0.99 * (1 + math.cos(math.pi * done)) / 2)
         index = torch.randint(len(data["slopes"]), (BATCH,), generator=random)
         spread = torch.rand(BATCH, 1, generator=random) * largest
         rings, cameras, slopes = turned(data, index, torch.randn(BATCH, 2, generator=random) * spread)
@@ -172,7 +180,7 @@ def train(data: dict[str, Tensor], held: dict[str, Tensor], seconds: float, seed
         nn.utils.clip_grad_norm_(horizon.parameters(), 5.0)
         optimizer.step()
         updates += 1
-        if time.perf_counter() - begun > said:
+        if time.perf_counter() - start > said:
             say(f"{updates} updates, {done:.0%}, loss {loss.item():.3f}: {errors_on(held, horizon)}")
             said += max(120.0, seconds / 20)
     horizon.eval().requires_grad_(False)
