@@ -17,6 +17,7 @@ from bevcli.model.road_slopes import SPREAD, RoadSlopes, inverse_of_two
 ROWS, COLUMNS, STEP_DEG = 112, 1440, 0.25  # of the ring, and between two of either
 FOLD = 8  # columns of the ring to a direction of the network
 UNIT = 0.02  # of the slopes that the network states
+DOUBT = 2.0  # times the variance that the directions of a frame tell, which err alike
 INSIDE = 2.0  # pixels between what a camera sees and the edges of its image
 
 
@@ -83,7 +84,8 @@ class Horizon(nn.Module):
         images: (B, N, 3, H, W), normalised; zero in their padding, and where an image is missing. image_from_bev:
         (B, N, 4, 4), bev metres to pixels of these images.
         """
-        return self.slopes(*self.rises(*self.view(images, image_from_bev)))
+        told = self.slopes(*self.rises(*self.view(images, image_from_bev)))
+        return RoadSlopes(told.mean, DOUBT * told.covariance)
 
     def view(self, images: Tensor, image_from_bev: Tensor) -> tuple[Tensor, Tensor]:
         """The ring in grey, and where a camera sees it (1, else 0), (B, ROWS, COLUMNS) each.
