@@ -285,6 +285,7 @@ def test_a_slow_drive_keeps_its_rate_and_a_fast_one_is_thinned() -> None:
     for step_s, rate_hz, frames in ((1.0, 1.0, 4), (0.1, 2.0, 1)):
         facts = look_at([TrueDrive(4, step_s=step_s)], FRAME)
         table = model_table("m", "quick", facts)
+        assert "horizon" not in table  # of demo, which knows renderings only
         assert (table["rate_hz"], table["training"]["clips"]["frames"]) == (rate_hz, frames)
     assert table["training"]["held_out"] == 0
 
