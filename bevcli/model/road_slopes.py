@@ -4,9 +4,8 @@ Images of two frames tell the slopes: the vehicle travels along the road, so tha
 and how all points turn tells by how much pitch and roll changed. The boxes of a detector tell both once more
 (`bevcli.model.lift`), less exactly.
 
-The network sees images as the cameras would see them if the vehicle stood level with the road: one that was trained on
-level rigs loses a fifth of its objects at one degree of pitch, however exactly the rig states it. So the images are
-turned, not only the rig.
+With these slopes the network sees images as the cameras would see them if the vehicle stood level with the road: one
+that was trained on level rigs loses a little more where only the rig is turned.
 """
 
 from collections.abc import Mapping, Sequence
