@@ -150,6 +150,7 @@ WRONG = {
         ("frames = [-1, 0]", "", '"frames" is missing; expected a list, each element'),
         ("frames = [-1, 0]", "frames = [-2, -1]", "frames must be ascending, and hold 0, the current frame"),
         ("can_bus = false", "can_bus = true", "ego_motion: can_bus, shift and rotation must be false"),
+        ("frames = [-1, 0]", "frames = [-1, 0]\nhorizon = true", "horizon and hybrid_queries must be left out"),
         ("260, 1600, 900]", "260, 1600, 901]", "crop must be left, top, right, bottom inside size"),
         ('architecture = "BEVFormerV2"', "", 'unknown key "f'),
     ],

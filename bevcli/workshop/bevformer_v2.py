@@ -74,6 +74,8 @@ class BEVFormerV2Config(ModelConfig):
             raise ValueError("frames must be ascending, and hold 0, the current frame")
         if self.ego_motion.can_bus or self.ego_motion.shift or self.ego_motion.rotation:
             raise ValueError("ego_motion: can_bus, shift and rotation must be false: BEVFormerV2 has no recurrence")
+        if self.horizon or self.hybrid_queries.count:
+            raise ValueError("horizon and hybrid_queries must be left out: they are parts of a BEVFormer alone")
 
     @property
     def past_frames(self) -> int:
