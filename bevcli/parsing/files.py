@@ -26,8 +26,10 @@ LIMIT_MEMORY = """
 def limit_memory():
     try:
         import resource
-        resource.setrlimit(resource.RLIMIT_DATA, ({memory}, {memory}))
-    except (ImportError, ValueError, OSError):
+        with open("/proc/self/statm") as file:  # where imports take more or less, by the processor
+            most = {memory} + int(file.read().split()[5]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    except (ImportError, LookupError, ValueError, OSError):
         pass
 """
 
