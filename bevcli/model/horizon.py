@@ -12,13 +12,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.road_slopes import SPREAD, RoadSlopes, inverse_of_two
+from bevcli.model.road_slopes import SPREAD, RoadSlopes
 
 ROWS, COLUMNS, STEP_DEG = 112, 1440, 0.25  # of the ring, and between two of either
 FOLD = 8  # columns of the ring to a direction of the network
 UNIT = 0.02  # of the slopes that the network states
 DOUBT = 2.0  # times the variance that the directions of a frame tell, which err alike
 INSIDE = 2.0  # pixels between what a camera sees and the edges of its image
+
+
+def angles(count: int) -> Tensor:
+    """Of so many rows or columns of the ring, radians, rising and about 0."""
+    return torch.deg2rad(STEP_DEG * (torch.arange(count) - (count - 1) / 2))
 
 
 class Ring(nn.Module):
@@ -29,8 +34,7 @@ class Ring(nn.Module):
     def __init__(self, rows: int = ROWS) -> None:
         super().__init__()
         self.rows = rows
-        up, around = (torch.deg2rad(STEP_DEG * (torch.arange(count) - (count - 1) / 2)) for count in (rows, COLUMNS))
-        up, around = torch.meshgrid(-up, around, indexing="ij")
+        up, around = torch.meshgrid(-angles(rows), angles(COLUMNS), indexing="ij")
         rays = torch.stack([up.cos() * around.cos(), up.cos() * around.sin(), up.sin()]).flatten(1)
         self.register_buffer("rays", rays, persistent=False)  # (3, rows · COLUMNS)
 
@@ -72,8 +76,8 @@ class Horizon(nn.Module):
         nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]
         nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
         self.log_shares = nn.Parameter(torch.full((2, 1), -4.0))  # of the precisions: neighbours err alike
-        azimuth = torch.deg2rad(STEP_DEG * (torch.arange(COLUMNS) - (COLUMNS - 1) / 2))
-        ahead, left = (wave.unflatten(0, (-1, FOLD)).mean(1) for wave in (azimuth.cos(), azimuth.sin()))
+        around = angles(COLUMNS)
+        ahead, left = (wave.unflatten(0, (-1, FOLD)).mean(1) for wave in (around.cos(), around.sin()))
         told = torch.stack([torch.stack([ahead, left], -1), torch.stack([-left, ahead], -1)])
         self.register_buffer("told", told, persistent=False)  # (2, COLUMNS / FOLD, 2), what each slope adds to both
         self.requires_grad_(False)
@@ -117,9 +121,8 @@ class Horizon(nn.Module):
         weights = (self.log_shares - 2 * log_errors).exp() / UNIT**2
         weighted = (weights[..., None] * self.told).flatten(1, 2)  # (B, 2 · COLUMNS / FOLD, 2)
         information = weighted.transpose(1, 2) @ self.told.flatten(0, 1)
-        covariance = inverse_of_two(information + torch.eye(2, device=weights.device) / SPREAD**2)
-        pull = (weighted * rises.flatten(1)[..., None]).sum(1)
-        return RoadSlopes((covariance * pull[:, None]).sum(-1), covariance)
+        information = information + torch.eye(2, device=weights.device) / SPREAD**2
+        return RoadSlopes.fitting(information, (weighted * rises.flatten(1)[..., None]).sum(1))
 
 
 class Around(nn.Module):

@@ -138,8 +138,7 @@ class Lift(nn.Module):
         else:
             information = inverse_of_two(expected.covariance)
             products, pull = products + information, pull + (information * expected.mean[:, None]).sum(-1)
-        covariance = inverse_of_two(products)
-        return RoadSlopes((covariance * pull[:, None]).sum(-1), covariance)
+        return RoadSlopes.fitting(products, pull)
 
 
 class Rays:

@@ -45,6 +45,12 @@ class RoadSlopes:
         """Where nothing was measured."""
         return cls(torch.zeros(1, 2), SPREAD**2 * torch.eye(2)[None])
 
+    @classmethod
+    def fitting(cls, information: Tensor, pull: Tensor) -> "RoadSlopes":
+        """Of an information matrix (B, 2, 2) and its product (B, 2) with the slopes."""
+        covariance = inverse_of_two(information)
+        return cls((covariance * pull[:, None]).sum(-1), covariance)
+
     def to(self, device: torch.device) -> "RoadSlopes":
         """On a device, by one copy."""
         numbers = torch.cat([self.mean[..., None], self.covariance], -1).to(device)

@@ -26,10 +26,14 @@ LIMIT_MEMORY = """
 def limit_memory():
     try:
         import resource
-        with open("/proc/self/statm") as file:  # where imports take more or less, by the processor
-            most = {memory} + int(file.read().split()[5]) * resource.getpagesize()
+        most = {memory}
+        try:
+            with open("/proc/self/statm") as file:  # what imports take varies with the processor
+                most += int(file.read().split()[5]) * resource.getpagesize()
+        except OSError:  # no Linux
+            pass
         resource.setrlimit(resource.RLIMIT_DATA, (most, most))
-    except (ImportError, LookupError, ValueError, OSError):
+    except (ImportError, ValueError, OSError):
         pass
 """
 

@@ -21,9 +21,7 @@ SIZE = 120, 200  # height and width
 
 def looking(yaw_deg: float, pitch_deg: float = 0.0) -> np.ndarray:
     """(4, 4) image_from_bev of a camera of 90 degrees; x forward, y left, z up."""
-    axes = np.array(
-        [[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
-    )  # camera from a bev frame that it looks along
+    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # of a camera that looks along x
     turn = axes @ Rotation.from_euler("zy", [yaw_deg, pitch_deg], degrees=True).as_matrix().T
     matrix, (height, width) = np.eye(4), SIZE
     matrix[:3, :3] = np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]]) @ turn
