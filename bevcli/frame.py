@@ -22,6 +22,7 @@ from bevcli.printing import counted, valid_text
 if TYPE_CHECKING:
     from torch import Tensor
 
+BLANK_STEP, BLANK_LEVELS = 16, 8  # pixels; grey levels between which those of an image are that shows nothing
 MOST_MAP_CLASSES = 8  # a BEV map has one bit for each class
 
 
@@ -58,6 +59,12 @@ class CameraImage:
     pixels_bgr: NDArray[np.uint8]
     encoded: bytes | None = None
     media_type: str | None = None
+
+    @cached_property
+    def is_blank(self) -> bool:
+        """It shows nothing: all of it has one colour, as of a dead camera."""
+        some = self.pixels_bgr[::BLANK_STEP, ::BLANK_STEP]
+        return int(np.ptp(some, axis=(0, 1)).max()) <= BLANK_LEVELS
 
 
 @dataclass(frozen=True)
@@ -208,10 +215,11 @@ class Frame:
         return texts
 
     def sees(self, boxes: Boxes3D) -> NDArray[np.bool_]:
-        """(N,) bool, boxes of the world frame whose vertical axis is in an image: its foot, its middle or its top."""
+        """(N,) bool, boxes of the world frame whose vertical axis is in an image that is not blank: its foot, its
+        middle or its top."""
         points = boxes.centers[:, None] + boxes.sizes_lwh[:, None, 2:] * [[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]]
         seen = np.zeros(len(boxes), dtype=bool)
-        for name in self.images:
+        for name in (name for name, image in self.images.items() if not image.is_blank):
             in_ego = apply(inverse(self.world_from_ego_at[name].matrix), points)  # (N, 3, 3)
             seen |= self.rig[name].sees(in_ego).any(-1)
         return seen

@@ -30,7 +30,7 @@ import pkgutil, importlib, bevcli
 for module in pkgutil.walk_packages(bevcli.__path__, "bevcli."):
     if not module.name.endswith("__main__") and "triton" not in module.name:
         importlib.import_module(module.name)
-from bevcli.inference.load import peak_memory
+from bevcli.workshop.benchmark.measure import peak_memory
 import torch
 assert peak_memory(torch.device("cpu")) == 0
 """

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.transforms import Array, Pose, interpolate, rigid, rotation_from_quaternion
+from bevcli.geometry.transforms import Array, Pose, interpolate, rotation_from_quaternion
 
 GRAVITY = 9.81  # m/s², the reading of an accelerometer at rest along z
 TOLERANCE_NS = 50_000_000  # a time this far outside the stored range is accepted: the motion goes on there
@@ -32,13 +31,6 @@ class Kinematics:
     acceleration: Array
     angular_rate: Array
     velocity: Array
-
-
-def motion_during(seconds: float, kinematics: Kinematics) -> Array:
-    """(4, 4) ego_from_later_ego: the motion at constant velocity and angular rate. seconds: may be negative."""
-    turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
-    half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
-    return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)
 
 
 @dataclass(frozen=True)
@@ -153,25 +145,6 @@ def nearest(times: NDArray[Any], targets: ArrayLike) -> NDArray[np.int64]:
     later = np.clip(np.searchsorted(times, targets), 1, max(len(times) - 1, 1))
     earlier, later = later - 1, np.minimum(later, len(times) - 1)
     return np.where(targets - times[earlier] <= times[later] - targets, earlier, later)
-
-
-# Times (T,) in ns, translations (T, 3) in metres in the world frame, and quaternions (T, 4) of world_from_ego.
-PoseTable: TypeAlias = tuple[NDArray[np.int64], Array, Array]
-
-
-def motion_of_keyframes(keyframes: PoseTable, others: PoseTable) -> EgoMotion:
-    """The poses at the times of keyframes, which increase, and at other times in any order.
-
-    Kinematics are derived from the keyframes only: differentiating poses a few milliseconds apart amplifies noise.
-    """
-    key_times = keyframes[0]
-    rough = EgoMotion(*keyframes, *derive_kinematics(*keyframes))
-    # Of equal times the first is kept, so that keyframes take precedence.
-    times, first = np.unique(np.concatenate([key_times, others[0]]), return_index=True)
-    translations, quaternions = (np.concatenate([keyframes[k], others[k]])[first] for k in (1, 2))
-    derived = [rough.kinematics_at(int(time)) for time in np.clip(times, key_times[0], key_times[-1])]
-    kinematics = zip(*(vars(at_time).values() for at_time in derived), strict=True)
-    return EgoMotion(times, translations, quaternions, *map(np.stack, kinematics))
 
 
 def derive_kinematics(

@@ -2,10 +2,8 @@
 
 import copy
 import hashlib
-import platform
 import re
 import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -45,11 +43,6 @@ from bevcli.registry import entries, is_of_hub, load
 from bevcli.sequences.files.calibration_file import CALIBRATION, draft_calibration, read_calibration
 from bevcli.sequences.images import AT_REST
 from bevcli.writing import weights_folder
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
 
 WEIGHTS_SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
 UNTRAINED_SEED = 0  # two untrained runs of one drive agree
@@ -494,24 +487,3 @@ def choose_device(name: str | torch.device) -> torch.device:
     if name == "auto":
         name = "cuda" if available else "cpu"
     return torch.device(name)
-
-
-def describe_machine(device: torch.device) -> str:
-    """Name of the processor or GPU, number of threads and PyTorch's version."""
-    if device.type == "cuda":
-        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    cpu = Path("/proc/cpuinfo")
-    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    capability = torch.backends.cpu.get_cpu_capability()
-    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-
-
-def peak_memory(device: torch.device) -> int:
-    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU. 0 on Windows, which does not tell."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    if resource is None:
-        return 0
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

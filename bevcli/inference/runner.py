@@ -17,6 +17,7 @@ from bevcli.frame import BevMap, Drive, Frame, FrameResult, FrameStamp, NewStart
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.inference import StepOptions
 from bevcli.inference.attention import AttentionProbe, attention_view, probe_cells
+from bevcli.inference.box_memory import BoxMemory, remember
 from bevcli.inference.pipeline import StageClock, image_uploader, origin, read_ahead, read_back
 from bevcli.inference.preprocess import Preprocessor, camera_boxes
 from bevcli.inference.tracking import TrackerConfig, TrackerState, track, without_identities
@@ -43,11 +44,13 @@ class RunnerState(Generic[Memory]):
         memory: of the model, None for nothing; the runner only passes it on.
         stamp: of the frame; None where the next frame starts anew.
         tracks: of the tracker; None before the first frame or without tracks.
+        boxes: that are remembered; None before the first frame, and where the model remembers none.
     """
 
     memory: Memory | None = None
     stamp: FrameStamp | None = None
     tracks: TrackerState | None = None
+    boxes: BoxMemory | None = None
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class BegunStep:
     upcoming: Sequence[PreparedFrame]  # the frames after it that the model sees
     start: RunnerState[Any]  # the state before the frame, without history where it starts anew
     started_anew: NewStart | None  # the reason for it, None where it does not
-    after: RunnerState[Any]  # the state after the frame where its numbers are finite, without tracks
+    after: RunnerState[Any]  # the state after the frame where its numbers are finite, without tracks and boxes
     # waits for the outputs, see `read_back`; None for a frame without images
     read: Callable[[], tuple[ModelOutputs, bool]] | None = None
     probe: AttentionProbe | None = None  # of the attention, where it was asked for
@@ -141,12 +144,12 @@ class Runner:
                 or without images are not used.
         """
         state = state or RunnerState()
-        return self.finish(self.begin(state, prepared, upcoming), state.tracks)
+        return self.finish(self.begin(state, prepared, upcoming), state)
 
     def begin(
         self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
     ) -> BegunStep:
-        """Launches a step, of which a GPU computes most afterwards. Arguments: see `step`; tracks are not used."""
+        """Launches a step, of which a GPU computes most afterwards. Arguments: see `step`; boxes are not used."""
         frame = prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
@@ -164,12 +167,12 @@ class Runner:
         after = RunnerState(memory, frame.stamp)
         return BegunStep(prepared, self.clock.marks, later, state, started_anew, after, read, probe)
 
-    def finish(self, begun: BegunStep, tracks: TrackerState | None) -> tuple[RunnerState[Any], Prediction]:
-        """Waits for a step; returns what `step` does. tracks: before the frame."""
+    def finish(self, begun: BegunStep, before: RunnerState[Any]) -> tuple[RunnerState[Any], Prediction]:
+        """Waits for a step; returns what `step` does. before: the state whose tracks and boxes are those before it."""
         prepared, start, probe = begun.prepared, begun.start, begun.probe
         if begun.read is None:
             prediction = self._prediction(prepared, begun.started_anew, skipped=True)
-            return replace(start, tracks=tracks), prediction
+            return replace(start, tracks=before.tracks, boxes=before.boxes), prediction
         with torch.inference_mode():
             last_layers, is_finite = begun.read()
             if is_finite:
@@ -184,6 +187,10 @@ class Runner:
                     part = origin(self.model, lambda: self.model.step(prepared, start.memory, begun.upcoming))
                 after, fields = self._restarted(start), {"not_finite": part}
         prediction = self._prediction(prepared, begun.started_anew, **fields)
+        tracks, boxes, fade_s = before.tracks, None, self.config.decoder.remember_s
+        if fade_s and self.options.temporal and not prediction.not_finite:
+            known = None if begun.started_anew else before.boxes
+            boxes, prediction = remember(known, prepared.frame, prediction, fade_s)
         if not self.options.unseen and len(prediction.boxes):
             world = prediction.boxes_world
             unseen = ~prepared.frame.sees(world)
@@ -191,7 +198,7 @@ class Runner:
             vars(prediction)["boxes_world"] = replace(world, unseen=unseen)  # the cached property
         if self.tracker is not None and not self._tracks:
             tracks, prediction = track(self.tracker, tracks, prediction)
-        return replace(after, tracks=tracks), prediction
+        return replace(after, tracks=tracks, boxes=boxes), prediction
 
     def _decoded(self, last_layers: ModelOutputs, begun: BegunStep) -> dict[str, Any]:
         """The fields of a prediction that are decoded from the outputs of the last layers, on the CPU."""
@@ -242,7 +249,7 @@ class Runner:
             yield from self._overlapped(frames, state)
             return
         for prepared, upcoming in frames:
-            state, prediction = self.finish(self.begin(state, prepared, upcoming), state.tracks)
+            state, prediction = self.finish(self.begin(state, prepared, upcoming), state)
             yield prepared.frame, prediction, state
 
     def _overlapped(
@@ -259,7 +266,7 @@ class Runner:
             except Exception as raised:  # after the frame before it
                 error = raised
             if begun is not None:
-                state, prediction = self.finish(begun, state.tracks)
+                state, prediction = self.finish(begun, state)
                 yield begun.prepared.frame, prediction, state
                 if following is not None and prediction.not_finite:  # it was begun with a history that is not finite
                     following = self.begin(state, following.prepared, following.upcoming)

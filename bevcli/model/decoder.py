@@ -43,6 +43,9 @@ class DecoderConfig:
     # share of its score that a box loses at the place of a better box of its class, and less beside it; see `faded`.
     # With 0, as published, scores stay as they are
     fade_duplicates: Share = 0.0
+    # time in seconds in which the score of a box that no camera sees any more falls to 1/e; see
+    # `bevcli.inference.box_memory`. With 0, as published, no box is remembered
+    remember_s: NotNegative = 0.0
     # number of sets of queries that are trained side by side, each to find every object (Group DETR, Chen et al. 2023).
     # Inference uses the first set only
     training_groups: Count = 1

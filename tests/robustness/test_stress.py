@@ -19,6 +19,7 @@ from bevcli.geometry.transforms import Pose, apply, inverse
 from bevcli.inference import run
 from bevcli.inference.load import Model
 from bevcli.inference.runner import Runner
+from bevcli.workshop.calibration.views import motion_during
 from bevcli.workshop.robustness.conditions import (
     NAMES,
     BodyPitch,
@@ -31,7 +32,6 @@ from bevcli.workshop.robustness.conditions import (
     _turned,
     at_lower_rate,
     choose_conditions,
-    motion_during,
 )
 from bevcli.workshop.robustness.stress import (
     ConditionScores,

@@ -33,7 +33,7 @@ import torch
 from bevcli._version import __version__
 from bevcli.config import known_models, load_config
 from bevcli.errors import BevcliError
-from bevcli.inference.load import choose_device, describe_machine
+from bevcli.inference.load import choose_device
 from bevcli.inference.pipeline import image_uploader
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import Runner
@@ -48,6 +48,7 @@ from bevcli.workshop.benchmark.versions import (
     MadeUpDrive,
     QueryResults,
     Version,
+    describe_machine,
     difference,
     largest_differences,
     made_up_model,

@@ -66,15 +66,6 @@ class ClassNames:
             exact = target if target in self.known else targets[target.lower()]
             self._by_lower_case[name.lower()] = self._by_name[name] = exact
 
-    @staticmethod
-    def of_format(table: Mapping[str, str], renames: Mapping[str, str]) -> "ClassNames":
-        """The names of a format that has names of its own. table: its names -> nuScenes' classes.
-
-        A name that the user renames keeps its name, so that `renames` finds it.
-        """
-        renamed = {name.lower() for name in renames}
-        return ClassNames({name: target for name, target in table.items() if name.lower() not in renamed})
-
     def __getitem__(self, name: str) -> str:
         exact = self._by_name.get(name)
         if exact is None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bevcli.errors import InputError
-from bevcli.geometry.cameras import Camera, CameraRig
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.ego_motion import EgoMotion, derive_kinematics
 from bevcli.geometry.transforms import Array, GeoOrigin
 from bevcli.options import named
@@ -26,7 +26,6 @@ ACCELERATION = ("ax", "ay", "az")
 ANGULAR_RATE = ("wx", "wy", "wz")
 VELOCITY = ("vx", "vy", "vz")
 NORM_TOLERANCE = 1e-3  # largest deviation of a quaternion's norm from 1
-AHEAD = np.radians(45)  # largest yaw of a camera that looks ahead
 
 
 class FrameTimesNeeded(InputError):
@@ -42,11 +41,6 @@ class DrivePoses:
     times_ns: NDArray[np.int64] | None = None  # (F,) of its frames; None while they are not known
     rig_is_open: bool = False  # the poses of its cameras are one of several readings
     numbers: NDArray[np.int64] | None = None  # (F,) of its frames, as times_ns
-
-    @property
-    def cameras_ahead(self) -> list[Camera]:
-        """The cameras that look ahead."""
-        return [camera for camera in self.rig.cameras if abs(camera.yaw) <= AHEAD]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -18,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from bevcli.config import load_config
 from bevcli.frame import Frame, Prediction
-from bevcli.inference.load import Model, choose_device, describe_machine, peak_memory
+from bevcli.inference.load import Model, choose_device
 from bevcli.inference.pipeline import write_behind
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
@@ -35,10 +36,16 @@ from bevcli.workshop.benchmark.versions import (
     MadeUpDrive,
     Version,
     compare_with_plain,
+    describe_machine,
     made_up_model,
     wait_for,
 )
 from bevcli.writing import whole_file
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 MIN_RUN_FRAMES = 4  # of a run with reading and recording; the times between them are measured, but for the last
 RUN_FRAMES = 12  # of a run if frames are short
@@ -356,3 +363,12 @@ def measure_speed() -> dict[str, str]:
     if hasattr(os, "getloadavg"):
         load = f"{os.getloadavg()[0]:.1f} processes wanted a core in the last minute, this one included"
     return rows | {"load": load}
+
+
+def peak_memory(device: torch.device) -> int:
+    """Peak memory in bytes: of the whole process on a CPU, of tensors on a GPU. 0 on Windows, which does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    if resource is None:
+        return 0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -2,10 +2,12 @@
 
 import copy
 import math
+import platform
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -21,7 +23,7 @@ from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, defaul
 from bevcli.geometry.ego_motion import GRAVITY, Kinematics
 from bevcli.geometry.transforms import Pose, rigid, rotation_about_z
 from bevcli.inference import EXPORTED_SUFFIX, TORCH, ModelOptions
-from bevcli.inference.load import Model, choose_engine, describe_machine, installed_engines, load_model
+from bevcli.inference.load import Model, choose_engine, installed_engines, load_model
 from bevcli.inference.machine import keep_freed_memory, return_freed_memory
 from bevcli.inference.pipeline import StageClock
 from bevcli.inference.runner import Runner, RunnerState
@@ -378,3 +380,15 @@ def compare_engines(model: str, frames: int) -> EngineTable:
 
 def _line(name: str, *cells: str) -> str:
     return f"{name:<18}" + "".join(f"{cell:>20}" if "to" in cell.split() else f"{cell:>14}" for cell in cells)
+
+
+def describe_machine(device: torch.device) -> str:
+    """Name of the processor or GPU, number of threads and PyTorch's version."""
+    if device.type == "cuda":
+        return f"{torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
+    cpu = Path("/proc/cpuinfo")
+    lines = cpu.read_text(encoding="utf-8").splitlines() if cpu.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    name = names[0] if names else platform.processor() or platform.machine()
+    capability = torch.backends.cpu.get_cpu_capability()
+    return f"{name} ({capability}), {torch.get_num_threads()} threads, PyTorch {torch.__version__}"

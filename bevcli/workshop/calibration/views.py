@@ -4,6 +4,7 @@ from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -11,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame
 from bevcli.geometry.cameras import Camera, CameraRig
-from bevcli.geometry.ego_motion import EgoMotion, motion_during
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics
+from bevcli.geometry.transforms import Array, rigid
 from bevcli.workshop.calibration import CalibrateOptions
 from bevcli.workshop.calibration.estimates import DELAYS_S, OF_PAIR, Unknowns
 from bevcli.workshop.correspondence.images import (
@@ -257,3 +258,10 @@ def depths_of(unknowns: Unknowns, matches: PointMatches) -> DepthResiduals:
     group = np.array([groups[k] for k in kept], dtype=np.int64)
     rays_later = np.array([later[keys[k]] for k in kept]).reshape(-1, 3)
     return DepthResiduals(group, at_once.rays_a[kept], at_once.rays_b[kept], rays_later, at_once.focal[kept])
+
+
+def motion_during(seconds: float, kinematics: Kinematics) -> Array:
+    """(4, 4) ego_from_later_ego: the motion at constant velocity and angular rate. seconds: may be negative."""
+    turn, _ = cv2.Rodrigues(seconds * kinematics.angular_rate)
+    half_turn, _ = cv2.Rodrigues(seconds / 2 * kinematics.angular_rate)
+    return rigid(half_turn @ (seconds * np.asarray(kinematics.velocity)), turn)

@@ -7,10 +7,11 @@ from pathlib import Path
 import torch
 
 from bevcli.config import load_config
-from bevcli.inference.load import choose_device, describe_machine, installed_engines
+from bevcli.inference.load import choose_device, installed_engines
 from bevcli.model.kernels.choose import choose_kernels, has_triton
 from bevcli.model.kernels.onednn import has_matrix_unit, has_onednn
 from bevcli.model.network import build_network
+from bevcli.workshop.benchmark.versions import describe_machine
 
 
 def processor() -> str | dict[str, str]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import EgoMotion, motion_of_keyframes
+from bevcli.geometry.ego_motion import EgoMotion
 from bevcli.geometry.transforms import Array, Pose, rigid, rotation_from_quaternion, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER
 from bevcli.parsing.files import MIB, read_bytes
@@ -24,8 +24,9 @@ from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import Argoverse2Options
-from bevcli.workshop.formats.labels import with_track_velocities
+from bevcli.workshop.formats.labels import names_of_format, with_track_velocities
 from bevcli.workshop.formats.matching import FARTHEST, CameraImages, frames_at
+from bevcli.workshop.formats.poses import motion_of_keyframes
 
 # Class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as BOLLARD, SIGN
 # and STROLLER, stay as they are, and are not scored.
@@ -117,7 +118,7 @@ def open_log(path: Path, common: InputOptions, options: Argoverse2Options) -> Li
     motion = _read_motion(path / "city_SE3_egovehicle.feather", options.axle_height_m)
     images = {name: _images(path / "sensors/cameras" / name) for name in rig.names}
     annotated = (path / ANNOTATIONS).exists()
-    names = ClassNames.of_format(CLASS_OF_CATEGORY, common.class_map)
+    names = names_of_format(CLASS_OF_CATEGORY, common.class_map)
     boxes = _read_annotations(path / ANNOTATIONS, motion, options, names) if annotated else {}
     entries, notes = _entries(path, images, np.array(sorted(boxes), dtype=np.int64))
     times = [entry.stamp.timestamp_ns for entry in entries] if common.ground_truth else []

@@ -15,15 +15,14 @@ from bevcli.errors import InputError
 from bevcli.frame import FrameStamp
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import PoseTable, motion_of_keyframes
 from bevcli.geometry.transforms import Array, Pose, inverse, yaw_of_rotation
 from bevcli.parsing.documents import LARGEST_INTEGER, Number, Text, read_json, typed
-from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import Format
 from bevcli.sequences.images import FrameEntry, ImageSource, ListedDrive, bev_frame_notes, leads_out
 from bevcli.sequences.options import InputOptions
-from bevcli.workshop.formats.labels import with_track_velocities
+from bevcli.workshop.formats.labels import names_of_format, with_track_velocities
+from bevcli.workshop.formats.poses import PoseTable, motion_of_keyframes
 
 # DDAD's class names; docs/other-inputs.md says what is lost. Names are compared without case; others, such as Wheeled
 # Slow and Train, stay as they are, and are not scored.
@@ -323,7 +322,7 @@ def _scene_file(path: Path) -> Path:
 
 def _read_ontology(folder: Path, scene: _SceneFile, class_map: Mapping[str, str]) -> dict[int, str]:
     path = folder / "ontology" / f"{scene.ontologies.get(BOXES_3D)}.json"
-    names = ClassNames.of_format(CLASS_OF_CATEGORY, class_map)
+    names = names_of_format(CLASS_OF_CATEGORY, class_map)
     return {each.id: names[each.name] for each in typed(read_json(path), _OntologyFile, path).items}
 
 

@@ -23,7 +23,7 @@ from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import CsvRow
 from bevcli.parsing.files import MIB, read_bytes
 from bevcli.printing import counted, name_of
-from bevcli.sequences.files.boxes_file import count_classes
+from bevcli.sequences.files.boxes_file import ClassNames, count_classes
 from bevcli.sequences.files.boxes_table import COLUMNS
 from bevcli.sequences.open import scenes_of
 from bevcli.workshop.formats import LabelOptions, UnlistedFrames
@@ -333,3 +333,12 @@ def _frame_of_reference(path: Path, rows: list[CsvRow]) -> Any:
         names = ", ".join(sorted(references))
         raise InputError(f"{path}: column frame_of_reference: expected world, ego or bev in all rows, found {names}")
     return references.pop()
+
+
+def names_of_format(table: Mapping[str, str], renames: Mapping[str, str]) -> ClassNames:
+    """The names of a format that has names of its own. table: its names -> nuScenes' classes.
+
+    A name that the user renames keeps its name, so that `renames` finds it.
+    """
+    renamed = {name.lower() for name in renames}
+    return ClassNames({name: target for name, target in table.items() if name.lower() not in renamed})

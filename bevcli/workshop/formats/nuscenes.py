@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from bevcli.errors import InputError
 from bevcli.frame import Frame, FrameStamp
 from bevcli.geometry.cameras import NUSCENES_YAWS_DEG, Camera, CameraRig, brown_conrady, default_ego_from_bev
-from bevcli.geometry.ego_motion import EgoMotion, Kinematics, motion_of_keyframes
+from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.parsing.files import is_there
-from bevcli.sequences.files.boxes_file import ClassNames
 from bevcli.sequences.files.calibration_file import checked_camera
 from bevcli.sequences.format import Format
 from bevcli.sequences.images import FrameEntry, ImageReader, ImageSource, ListedDrive, bev_frame_notes
 from bevcli.sequences.options import InputOptions
 from bevcli.workshop.formats import NuScenesOptions
+from bevcli.workshop.formats.labels import names_of_format
 from bevcli.workshop.formats.map_lines import MapExpansion
 from bevcli.workshop.formats.nuscenes_index import (
     NUSCENES,
@@ -37,6 +37,7 @@ from bevcli.workshop.formats.nuscenes_index import (
     tables_of,
 )
 from bevcli.workshop.formats.nuscenes_tables import open_index, read_rows
+from bevcli.workshop.formats.poses import motion_of_keyframes
 
 # The order of nuScenes' cameras in a rig. Other cameras follow, sorted by name.
 CAMERAS = tuple(NUSCENES_YAWS_DEG)
@@ -273,6 +274,6 @@ def open_t4(path: Path, common: InputOptions, options: Format) -> TableDrive:
     The ego frame is Autoware's base_link: below the rear axle, on the ground. The bev frame is the default, because the
     lidar's axes differ from those of nuScenes' LIDAR_TOP. Raises InputError as `TableDrive`.
     """
-    names = ClassNames.of_format(T4_CLASS_OF_CATEGORY, common.class_map)
+    names = names_of_format(T4_CLASS_OF_CATEGORY, common.class_map)
     dialect = Dialect(T4_LIDARS, names.__getitem__, T4_VISIBILITIES, has_attributes=False, bev_is_lidar=False)
     return TableDrive(path, path / "annotation", common, dialect, NuScenesOptions())

@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import cast
+from typing import TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ from bevcli.workshop.formats.pose_table import (
     read_table,
 )
 
+AHEAD = np.radians(45)  # largest yaw of a camera that looks ahead
 _UNIT_OF_NAME = re.compile(r"[_\[( ](s|ms|us|ns)[a-z]*[\])]?$|^(s)ec")
 PERIODS_S = 4e-4, 20.0  # between two rows: at most 2500 a second, and at least three a minute
 UNIT_ROWS = 50_000  # at the start, and the last one, whose times tell the unit
@@ -306,7 +307,7 @@ def _readings(table: Table, positions: Array, drive: DrivePoses, times_ns: NDArr
     if of_gps:
         stated["pose_axes"] = stated["pose_axes"] or "flu"
     zeroth = next((name for name in cameras if re.search("(?<![0-9])0+$", name)), "")
-    zeroth = zeroth or next((camera.name for camera in drive.cameras_ahead), "")
+    zeroth = zeroth or next((camera.name for camera in drive.rig.cameras if abs(camera.yaw) <= AHEAD), "")
     known = {name: None if drive.rig_is_open else drive.rig[name].ego_from_camera for name in cameras}
     readings = []
     for unit in _units(positions, rotations.values(), times_ns, drive):
@@ -401,3 +402,22 @@ def _of_angles(table: Table, drive: DrivePoses) -> dict[str, Array]:
             pitch, yaw = -pitch, (np.pi / 2 if kind.startswith("compass") else 0) - yaw
         rotations[kind] = quaternions_of_angles(roll, pitch, yaw)
     return rotations
+
+
+# Times (T,) in ns, translations (T, 3) in metres in the world frame, and quaternions (T, 4) of world_from_ego.
+PoseTable: TypeAlias = tuple[NDArray[np.int64], Array, Array]
+
+
+def motion_of_keyframes(keyframes: PoseTable, others: PoseTable) -> EgoMotion:
+    """The poses at the times of keyframes, which increase, and at other times in any order.
+
+    Kinematics are derived from the keyframes only: differentiating poses a few milliseconds apart amplifies noise.
+    """
+    key_times = keyframes[0]
+    rough = EgoMotion(*keyframes, *derive_kinematics(*keyframes))
+    # Of equal times the first is kept, so that keyframes take precedence.
+    times, first = np.unique(np.concatenate([key_times, others[0]]), return_index=True)
+    translations, quaternions = (np.concatenate([keyframes[k], others[k]])[first] for k in (1, 2))
+    derived = [rough.kinematics_at(int(time)) for time in np.clip(times, key_times[0], key_times[-1])]
+    kinematics = zip(*(vars(at_time).values() for at_time in derived), strict=True)
+    return EgoMotion(times, translations, quaternions, *map(np.stack, kinematics))

@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from bevcli.errors import InputError
 from bevcli.frame import Drive, Frame
-from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics, derive_kinematics, motion_of_keyframes
+from bevcli.geometry.ego_motion import GRAVITY, EgoMotion, Kinematics, derive_kinematics
 from bevcli.geometry.transforms import Array, Pose
+from bevcli.workshop.formats.poses import motion_of_keyframes
 from bevcli.workshop.odometry import OdometryOptions
 from bevcli.workshop.odometry.step_views import (
     CHANGE_RAD,

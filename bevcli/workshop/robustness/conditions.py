@@ -15,9 +15,9 @@ import numpy as np
 from bevcli.errors import InputError
 from bevcli.frame import CameraImage, DerivedDrive, Drive, Frame, FrameStamp
 from bevcli.geometry.cameras import OUTSIDE, Camera, CameraRig, camera_pose_noise
-from bevcli.geometry.ego_motion import motion_during
 from bevcli.geometry.transforms import Array, Pose, inverse
 from bevcli.sequences.open import select
+from bevcli.workshop.calibration.views import motion_during
 from bevcli.workshop.robustness import LostImage, SeverityChoice
 from bevcli.workshop.synth import corruptions
 from bevcli.workshop.synth.corruptions import ImageCorruption, Level, Pixels

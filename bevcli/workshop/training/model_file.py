@@ -22,11 +22,11 @@ from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.cameras import CameraRig, level_rig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.geometry.transforms import Array
-from bevcli.inference.load import peak_memory
 from bevcli.model.config import BevFrameConfig, fov_deg, tilt_deg
 from bevcli.printing import counted, duration
 from bevcli.sequences.open import open_sequence, scenes_of, select_rate
 from bevcli.sequences.options import InputOptions
+from bevcli.workshop.benchmark.measure import peak_memory
 from bevcli.workshop.synth import DriveOptions
 from bevcli.workshop.synth.drives import read_split
 from bevcli.workshop.training import Preset, TrainOptions
