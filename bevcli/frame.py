@@ -406,7 +406,7 @@ class Prediction:
 
     Attributes:
         stamp: of the frame.
-        boxes: all decoded boxes in the bev frame, highest score first, with classes and scores.
+        boxes: all boxes, remembered ones included, bev frame, highest score first, with classes and scores.
         ego_from_bev: (4, 4) pose of the bev frame in the ego frame.
         world_from_ego: the vehicle's pose at the frame's time.
         grid: the BEV grid.

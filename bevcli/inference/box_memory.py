@@ -7,6 +7,7 @@ import numpy as np
 from bevcli.frame import Frame, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.transforms import Array, inverse
+from bevcli.model.decoder import DecoderConfig
 
 GUESSED = 0.5  # share of its score that a box keeps which the model puts where no camera looks
 MISSED = 0.5  # share that a remembered box keeps where a camera looks and the model finds it no more
@@ -23,7 +24,7 @@ class BoxMemory:
 
 
 def remember(
-    memory: BoxMemory | None, frame: Frame, prediction: Prediction, fade_s: float
+    memory: BoxMemory | None, frame: Frame, prediction: Prediction, config: DecoderConfig
 ) -> tuple[BoxMemory, Prediction]:
     """The memory after a frame, and its prediction with the boxes that are remembered, best first.
 
@@ -34,7 +35,7 @@ def remember(
         memory: before the frame, None at the start.
         frame: the frame.
         prediction: of the model for it.
-        fade_s: time in which a remembered score falls to 1/e.
+        config: says how fast scores fade, and how many boxes the prediction has at most.
     """
     world_from_bev = prediction.world_from_ego.matrix @ prediction.ego_from_bev
     is_seen, time_ns = frame.sees(prediction.boxes_world), frame.stamp.timestamp_ns
@@ -42,7 +43,9 @@ def remember(
     if memory is not None and len(memory.boxes):
         old, seconds = memory.boxes, (time_ns - memory.timestamp_ns) / 1e9
         old = replace(old, centers=old.centers + seconds * np.pad(np.nan_to_num(old.velocities), ((0, 0), (0, 1))))
-        old = _weakened(old, np.exp(-seconds / fade_s) * np.where(frame.sees(old), MISSED, 1.0)).scored(FORGOTTEN)
+        old = _weakened(old, np.exp(-seconds / config.remember_s) * np.where(frame.sees(old), MISSED, 1.0)).scored(
+            FORGOTTEN
+        )
         old = old.transformed(inverse(world_from_bev))
         old = old[prediction.grid.holds(old.centers[:, :2])]
         away = np.linalg.norm(old.centers[:, None, :2] - new.centers[:, :2], axis=-1)
@@ -54,7 +57,7 @@ def remember(
     boxes = Boxes3D.concatenate([new, old])
     known = Boxes3D.concatenate([new[is_seen].scored(FORGOTTEN), old]).transformed(world_from_bev)
     best = np.argsort(-_scores(boxes), kind="stable")
-    return BoxMemory(known, time_ns), replace(prediction, boxes=boxes[best])
+    return BoxMemory(known, time_ns), replace(prediction, boxes=boxes[best[: config.max_boxes]])
 
 
 def _weakened(boxes: Boxes3D, share: Array) -> Boxes3D:

@@ -1,6 +1,5 @@
 """`load_model`: a configured model with its weights, on a device."""
 
-import copy
 import hashlib
 import re
 import shlex
@@ -30,7 +29,7 @@ from bevcli.inference import (
     ModelOptions,
     StepOptions,
 )
-from bevcli.inference.preprocess import checked_images, image_for_rig
+from bevcli.inference.preprocess import checked_images
 from bevcli.inference.runner import Runner
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model import AnyPrecision
@@ -162,12 +161,6 @@ class Model:
     def contents(self) -> dict[str, Any]:
         """The contents of the model's TOML file, [training] excluded."""
         return as_table(self.config, self.tracker)
-
-    def for_rig(self, rig: CameraRig) -> "Model":
-        """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
-        network = copy.copy(self.network)  # the copy has the same weights
-        network.config = replace(self.config, image=image_for_rig(rig, self.config.image))
-        return replace(self, network=network)
 
     def training_notes(self, rig: CameraRig) -> tuple[str, ...]:
         """Warnings where the rig or the model's file differs from the training; none for random weights."""

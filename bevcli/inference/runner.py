@@ -187,10 +187,10 @@ class Runner:
                     part = origin(self.model, lambda: self.model.step(prepared, start.memory, begun.upcoming))
                 after, fields = self._restarted(start), {"not_finite": part}
         prediction = self._prediction(prepared, begun.started_anew, **fields)
-        tracks, boxes, fade_s = before.tracks, None, self.config.decoder.remember_s
-        if fade_s and self.options.temporal and not prediction.not_finite:
+        tracks, boxes, decoder = before.tracks, None, self.config.decoder
+        if decoder.remember_s and self.options.temporal and not prediction.not_finite:
             known = None if begun.started_anew else before.boxes
-            boxes, prediction = remember(known, prepared.frame, prediction, fade_s)
+            boxes, prediction = remember(known, prepared.frame, prediction, decoder)
         if not self.options.unseen and len(prediction.boxes):
             world = prediction.boxes_world
             unseen = ~prepared.frame.sees(world)

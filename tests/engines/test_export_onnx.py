@@ -27,7 +27,7 @@ from bevcli.registry import entries, load
 from bevcli.sequences.open import open_sequence
 from bevcli.workshop.engines.export_form import replace_parts
 from bevcli.workshop.engines.export_onnx import export_onnx, read_metadata
-from bevcli.workshop.engines.exported import check_exported, load_exported
+from bevcli.workshop.engines.exported import check_exported, for_rig, load_exported
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -105,7 +105,7 @@ def test_a_file_for_wide_cameras_is_larger_and_embeds_the_rig(tmp_path):
         image_tokens=ImageTokensConfig(level_embeddings=3, calibration_embedding=True),
     )
     rig = make_rig({"FRONT": 0.0, "BACK": 180.0})
-    model = Model(network).for_rig(rig)
+    model = for_rig(Model(network), rig)
     assert (model.config.image.size, network.config.image.size) == ((144, 81), (96, 64))
     export_onnx(model.network, tmp_path / "wide.onnx", contents=model.contents(), cameras=2)
     differences = list(check_exported(tmp_path / "wide.onnx", Model(network), MemoryDrive(2, rig=rig)))

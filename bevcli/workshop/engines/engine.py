@@ -50,7 +50,7 @@ from bevcli.workshop.engines.export_onnx import (
     quantize,
     require,
 )
-from bevcli.workshop.engines.exported import Arrays, ExportedModel, LoadedFile
+from bevcli.workshop.engines.exported import Arrays, ExportedModel, LoadedFile, for_rig
 from bevcli.writing import user_cache, whole_file, write_whole
 
 FORMAT = 1  # of the files in the cache; increase it when they change in one version of bevcli
@@ -154,7 +154,7 @@ class Engine(LoadedFile):
     @classmethod
     def export(cls, model: Model, rig: CameraRig, drive: Drive | None) -> Model:
         """A model that is loaded for this engine, as an exported file for a rig: see `Model.in_engine`."""
-        sized = model.for_rig(rig)
+        sized = for_rig(model, rig)
         options = _options(sized, rig, cls.deformable_convolution)
         exact, is_int8 = CachedFile(_key(sized, options, "fp32")), model.precision == "int8"
         file, engine = exact, cls.in_precision(model.precision)

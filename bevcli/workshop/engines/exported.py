@@ -1,6 +1,7 @@
 """An exported file in the place of a model, and its comparison with the model over a drive: `check_exported`."""
 
 import contextlib
+import copy
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,10 +14,11 @@ from torch import Tensor, nn
 from bevcli.errors import BevcliError, WeightsError
 from bevcli.frame import BevMap, Drive, FrameResult
 from bevcli.geometry.boxes import Boxes3D
+from bevcli.geometry.cameras import CameraRig
 from bevcli.geometry.transforms import Pose
 from bevcli.inference import FILE_ENGINE, ModelOptions
 from bevcli.inference.load import Model, load_model
-from bevcli.inference.preprocess import Preprocessor
+from bevcli.inference.preprocess import Preprocessor, image_for_rig
 from bevcli.inference.runner import Runner, RunnerState
 from bevcli.model.prepare import prepare_for_inference
 from bevcli.model.step import ModelOutputs, PreparedFrame
@@ -265,7 +267,7 @@ def write_model(model: Model, file: FileOptions, options: OnnxOptions) -> tuple[
         if options.cameras is not None:
             raise BevcliError("`rig` states the number of cameras: leave `cameras` out")
         rig = read_calibration(options.rig)
-        model, options = model.for_rig(rig), replace(options, cameras=len(rig.cameras))
+        model, options = for_rig(model, rig), replace(options, cameras=len(rig.cameras))
     target = file.target(Path(f"{model.name}.onnx"))
     contents, untrained = model.contents(), model.untrained
     write_onnx(model.network, target, options, contents=contents, untrained=untrained, bundled=model.bundled)
@@ -302,3 +304,10 @@ def write_quantized(model: Path, drives: tuple[Path, ...], frames: int, engine: 
     opened = [open_sequence(path, rate_hz=network.config.rate_hz) for path in drives]
     write_int8(model, calibration_images(network.config, network.cameras, opened, frames), target)
     return target
+
+
+def for_rig(model: Model, rig: CameraRig) -> Model:
+    """The model with images of one size, that of a rig, for an exported file: see `ImageConfig.focal_px`."""
+    network = copy.copy(model.network)  # the copy has the same weights
+    network.config = replace(model.config, image=image_for_rig(rig, model.config.image))
+    return replace(model, network=network)
