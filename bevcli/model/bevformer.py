@@ -49,7 +49,7 @@ class EncoderInputs:
     history: Tensor | None  # (B, Y·X, C), the BEV map of the previous frame; None without history
     rotation: Tensor | None  # (B, 2, 3), of the history, see `map_rotation`; None without history
     image_boxes: ImageBoxes | None = None  # of a detector beside the backbone, None without one
-    expected_slopes: RoadSlopes | None = None  # see `ModelInputs`
+    expected_slopes: RoadSlopes | None = None  # before the boxes are looked at, see `Network.look`
     image_from_upright: Tensor | None = None  # (B, N, 3, 3), see `upright_images`; None: the images stay as they are
 
 
@@ -99,7 +99,7 @@ class BEVFormer(Network):
         size = inputs.image_size
         rays = rotation = image_from_upright = None
         cameras = inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes
-        boxes, image_from_level, slopes = self.look(*cameras, inputs.expected_slopes)
+        boxes, image_from_level, slopes, expected = self.look(*cameras, inputs.expected_slopes)
         upright_from_level = image_from_level
         if slopes is not None:
             upright_from_level, image_from_upright = upright_cameras(inputs.image_from_bev, image_from_level)
@@ -122,7 +122,7 @@ class BEVFormer(Network):
             history=history,
             rotation=rotation,
             image_boxes=boxes,
-            expected_slopes=inputs.expected_slopes,
+            expected_slopes=expected,
             image_from_upright=image_from_upright,
         )
         return encoder_inputs, slopes

@@ -159,7 +159,8 @@ class ModelConfig:
             denominator; a detector beside it sees them whole.
         image_detector: a detector beside the backbone, for the boxes in the images. None: the backbone itself, if it
             is one, tells these boxes.
-        horizon: the rig of each frame is levelled first, by the slopes of the road that `Horizon` tells.
+        horizon: the rig of each frame is levelled first, by the slopes of the road that `Horizon` tells; with
+            `hybrid_queries.level` by these and what boxes and points tell.
         neck: the feature pyramid network.
         image_tokens: camera and level embeddings.
         ego_motion: can-bus numbers and alignment of the history.
@@ -207,8 +208,6 @@ class ModelConfig:
             raise ValueError('hybrid_queries needs image_detector, or a backbone that is a detector, such as "nanodet"')
         if self.hybrid_queries.count and self.hybrid_queries.features != CHANNELS:
             raise ValueError(f"hybrid_queries.features must be the channels of the detector's maps, {CHANNELS}")
-        if self.horizon and self.levels:
-            raise ValueError("horizon and hybrid_queries.level both level the rig of each frame: leave out one of them")
         smaller, whole = self.backbone_scale
         if not 0 < smaller <= whole or self.image.pad_divisor * smaller % whole:
             raise ValueError("backbone_scale must be at most 1, and image.pad_divisor times it a whole number")

@@ -12,12 +12,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from bevcli.model.road_slopes import SPREAD, RoadSlopes
+from bevcli.model.road_slopes import RoadSlopes
 
 ROWS, COLUMNS, STEP_DEG = 112, 1440, 0.25  # of the ring, and between two of either
 FOLD = 8  # columns of the ring to a direction of the network
 UNIT = 0.02  # of the slopes that the network states
-DOUBT = 2.0  # times the variance that the directions of a frame tell, which err alike
 INSIDE = 2.0  # pixels between what a camera sees and the edges of its image
 
 
@@ -88,8 +87,7 @@ class Horizon(nn.Module):
         images: (B, N, 3, H, W), normalised; zero in their padding, and where an image is missing. image_from_bev:
         (B, N, 4, 4), bev metres to pixels of these images.
         """
-        told = self.slopes(*self.rises(*self.view(images, image_from_bev)))
-        return RoadSlopes(told.mean, DOUBT * told.covariance)
+        return self.slopes(*self.rises(*self.view(images, image_from_bev)))
 
     def view(self, images: Tensor, image_from_bev: Tensor) -> tuple[Tensor, Tensor]:
         """The ring in grey, and where a camera sees it (1, else 0), (B, ROWS, COLUMNS) each.
@@ -121,8 +119,8 @@ class Horizon(nn.Module):
         weights = (self.log_shares - 2 * log_errors).exp() / UNIT**2
         weighted = (weights[..., None] * self.told).flatten(1, 2)  # (B, 2 · COLUMNS / FOLD, 2)
         information = weighted.transpose(1, 2) @ self.told.flatten(0, 1)
-        information = information + torch.eye(2, device=weights.device) / SPREAD**2
-        return RoadSlopes.fitting(information, (weighted * rises.flatten(1)[..., None]).sum(1))
+        unknown = RoadSlopes.unknown().to(weights.device)
+        return unknown.joined(information, (weighted * rises.flatten(1)[..., None]).sum(1))
 
 
 class Around(nn.Module):

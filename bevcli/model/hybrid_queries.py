@@ -89,16 +89,25 @@ class HybridQueries(nn.Module):
 
     @torch.no_grad()
     def levelled(
-        self, boxes: ImageBoxes, image_from_bev: Tensor, sizes: Tensor, expected: RoadSlopes | None = None
-    ) -> tuple[Tensor, RoadSlopes]:
-        """(B, N, 4, 4), see `levelled`, and the slopes of the road; on the CPU.
+        self,
+        boxes: ImageBoxes,
+        image_from_bev: Tensor,
+        sizes: Tensor,
+        expected: RoadSlopes | None = None,
+        horizon: RoadSlopes | None = None,
+    ) -> tuple[Tensor, RoadSlopes, RoadSlopes | None]:
+        """(B, N, 4, 4), see `levelled`, and the slopes of the road, both on the CPU; and the slopes without the boxes.
 
-        Arguments: see `forward`; all but the boxes are on the CPU.
+        Arguments: see `forward`; all but boxes and horizon, the slopes that it tells, are on the CPU.
         """
         cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
-        told = self.lift(boxes, *cameras)[-1]
+        told, expected = self.lift(boxes, *cameras)[-1], cameras[-1]
+        if horizon is not None:
+            measured = horizon.measured(told)
+            told = told.joined(*measured)
+            expected = (expected or RoadSlopes.unknown().to(told.mean.device)).joined(*measured)
         told = told.to(image_from_bev.device)
-        return levelled(image_from_bev, told, -self.lift.ground_z), told
+        return levelled(image_from_bev, told, -self.lift.ground_z), told, expected
 
     def weighed(
         self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from bevcli.geometry.cameras import BEV_ORIGIN_M
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes
-from bevcli.model.road_slopes import SPREAD, RoadSlopes, adjugate_of_three, inverse_of_two
+from bevcli.model.road_slopes import RoadSlopes, adjugate_of_three
 
 NAMES = {"person": "pedestrian"}  # names of classes that are other ones in images
 # Of each image class: mean width, length and height of its objects, metres.
@@ -133,12 +133,7 @@ class Lift(nn.Module):
         weighted = (rays.bearing * weights[..., None]).flatten(1, 2)  # (B, N · K, 2)
         pull = (weighted * stated.flatten(1, 2)[..., None]).sum(1)
         products = (weighted[..., None] * rays.bearing.flatten(1, 2)[..., None, :]).sum(1)
-        if expected is None:
-            products = products + torch.eye(2, device=products.device) * SPREAD**-2
-        else:
-            information = inverse_of_two(expected.covariance)
-            products, pull = products + information, pull + (information * expected.mean[:, None]).sum(-1)
-        return RoadSlopes.fitting(products, pull)
+        return (expected or RoadSlopes.unknown().to(products.device)).joined(products, pull)
 
 
 class Rays:

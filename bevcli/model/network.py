@@ -108,22 +108,24 @@ class Network(TemporalModel):
         image_from_bev: Tensor,
         image_sizes: Tensor,
         expected: RoadSlopes | None = None,
-    ) -> tuple[ImageBoxes | None, Tensor, RoadSlopes | None]:
-        """The boxes of the detector beside the backbone, None without one; the level rig; the slopes that boxes tell.
+    ) -> tuple[ImageBoxes | None, Tensor, RoadSlopes | None, RoadSlopes | None]:
+        """What is seen before pillars are projected.
 
-        The rig is image_from_bev itself where the model does not level it; the slopes are None where no boxes do.
+        Returns the boxes of the detector beside the backbone, None without one; the level rig, which is image_from_bev
+        itself where the model does not level it; the slopes that all tell, None where boxes do not; and those without
+        the boxes.
 
         expected: slopes, see `expected_slopes`. Others: see `ModelInputs`.
         """
-        if self.horizon is not None:
-            slopes = self.find_slopes(images, image_from_bev).to(image_from_bev.device)
-            image_from_bev = levelled(image_from_bev, slopes, self.config.bev_frame.height_m)
+        seen = None if self.horizon is None else self.find_slopes(images, image_from_bev)
+        if seen is not None and not self.config.levels:
+            image_from_bev = levelled(image_from_bev, seen.to(image_from_bev.device), self.config.bev_frame.height_m)
         if self.image_detector is None:
-            return None, image_from_bev, None
+            return None, image_from_bev, None, expected
         boxes = self.find_image_boxes(images, has_image, image_sizes)
-        if self.hybrid_queries is None or not self.config.hybrid_queries.level:
-            return boxes, image_from_bev, None
-        return boxes, *self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes, expected)
+        if self.hybrid_queries is None or not self.config.levels:
+            return boxes, image_from_bev, None, expected
+        return boxes, *self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes, expected, seen)
 
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""

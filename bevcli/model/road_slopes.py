@@ -30,6 +30,7 @@ SCALE = 0.7  # of residuals, pixels: those far beyond are of what moves by itsel
 FEWEST, AGREE = 30, 0.6  # points; share of them within two scales. With less the poses are not of these images
 STANDS_M = 0.05  # a shorter way shows no direction
 STEPS, DIFFERENCE = 6, 1e-6
+CONTRADICTS = 6.0  # square of the distance of two measured slopes, in standard deviations: one in twenty is as far off
 LEVEL_FROM = 2.0  # squares of standard deviations that a slope exceeds before the rig is levelled by it
 
 
@@ -50,6 +51,19 @@ class RoadSlopes:
         """Of an information matrix (B, 2, 2) and its product (B, 2) with the slopes."""
         covariance = inverse_of_two(information)
         return cls((covariance * pull[:, None]).sum(-1), covariance)
+
+    def joined(self, information: Tensor, pull: Tensor) -> "RoadSlopes":
+        """With what was measured besides: its information matrix (B, 2, 2) and the product (B, 2) with the slopes."""
+        own = inverse_of_two(self.covariance)
+        return RoadSlopes.fitting(own + information, (own * self.mean[:, None]).sum(-1) + pull)
+
+    def measured(self, others: "RoadSlopes") -> tuple[Tensor, Tensor]:
+        """What `joined` takes of these slopes, which nothing was known of before; 0 where they contradict others."""
+        own, off = inverse_of_two(self.covariance), self.mean - others.mean
+        distance = (inverse_of_two(self.covariance + others.covariance) * off[:, None] * off[..., None]).sum((-2, -1))
+        agrees = (distance < CONTRADICTS).to(own.dtype)[:, None, None]
+        prior = torch.eye(2, device=own.device) / SPREAD**2
+        return agrees * (own - prior), agrees[..., 0] * (own * self.mean[:, None]).sum(-1)
 
     def to(self, device: torch.device) -> "RoadSlopes":
         """On a device, by one copy."""

@@ -185,7 +185,7 @@ def test_the_demo_model_is_as_small_as_the_model_card_states() -> None:
 
 def test_photographs_is_demo_with_the_eyes_of_a_detector() -> None:
     demo, photographs = load_config("demo"), load_config("photographs")
-    changed = "name", "image", "backbone_scale", "image_detector", "horizon", "hybrid_queries", "training_rigs"
+    changed = "name", "image", "backbone_scale", "image_detector", "hybrid_queries", "training_rigs"
     assert replace(photographs, **{name: getattr(demo, name) for name in changed}) == demo
     assert photographs.image_classes
     assert bundled_weights("photographs").stat().st_size < 14e6

@@ -95,9 +95,11 @@ def test_a_model_is_levelled_in_batches_as_alone():
     """And a training leaves the horizon as it is."""
     model, inputs = small_model(horizon=True), small_inputs(batch=2)
     model.horizon.network[-1].bias.data[:] = torch.tensor([0.5, -2.0, 0.0, -2.0])
-    boxes, level, slopes = model.look(inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
+    looked = model.look(inputs.images, inputs.has_image, inputs.image_from_bev, inputs.image_sizes)
+    boxes, level, slopes, expected = looked
     assert boxes is None
     assert slopes is None
+    assert expected is None
     assert not torch.allclose(level, inputs.image_from_bev, atol=1e-3)
     for index in range(2):
         parts = (x[index : index + 1] for x in (inputs.images, inputs.has_image, inputs.image_from_bev))

@@ -35,6 +35,7 @@ from bevcli.workshop.synth.rig import RigDistribution, draw_rig
 
 KEPT_ROWS = 144  # of the rings, more than the network sees, as they are turned
 GREY, CONTRAST = 110.0, 45.0  # of the kept rings
+DOUBT = 2.0  # times the variance that fits drives of a training, on others: chosen on four of these
 HELD_OUT = 12  # drives
 BATCH, RATE = 12, 2e-3
 PITCH_DEG, ROLL_DEG = 1.6, 1.3  # largest standard deviation of what is added
@@ -151,6 +152,7 @@ def train(
     random, horizon, rate = torch.Generator().manual_seed(seed), Horizon(), RATE / 4 if begun else RATE
     if begun:
         horizon.load_state_dict({key.removeprefix("horizon."): value.float() for key, value in begun.items()})
+        horizon.log_shares.data += math.log(DOUBT)
     else:
         plain = list(horizon.network)
         norms = [[x, nn.BatchNorm2d(x.out_channels)] if isinstance(x, nn.Conv2d) else [x] for x in plain[:-1]]
@@ -186,6 +188,7 @@ def train(
     horizon.eval().requires_grad_(False)
     fold_batch_norms(horizon.network, torch.device("meta"))
     horizon.network = nn.Sequential(*(x for x in horizon.network if not isinstance(x, nn.Identity)))
+    horizon.log_shares -= math.log(DOUBT)
     say(f"{updates} updates: {errors_on(held, horizon)}")
     return horizon
 

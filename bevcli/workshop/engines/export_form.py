@@ -121,7 +121,8 @@ class RecurrentStep(ExportedStep):
         expected = None
         if expected_slopes is not None and expected_covariance is not None:
             expected = RoadSlopes(expected_slopes, expected_covariance)
-        boxes, image_from_level, slopes = network.look(images, has_image, image_from_bev, image_sizes, expected)
+        looked = network.look(images, has_image, image_from_bev, image_sizes, expected)
+        boxes, image_from_level, slopes, expected = looked
         upright_from_level, image_from_upright = image_from_level, None
         if slopes is not None:
             upright_from_level, image_from_upright = upright_cameras(image_from_bev, image_from_level)
