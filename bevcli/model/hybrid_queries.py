@@ -89,25 +89,20 @@ class HybridQueries(nn.Module):
 
     @torch.no_grad()
     def levelled(
-        self,
-        boxes: ImageBoxes,
-        image_from_bev: Tensor,
-        sizes: Tensor,
-        expected: RoadSlopes | None = None,
-        horizon: RoadSlopes | None = None,
+        self, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor, RoadSlopes | None], horizon: RoadSlopes | None = None
     ) -> tuple[Tensor, RoadSlopes, RoadSlopes | None]:
         """(B, N, 4, 4), see `levelled`, and the slopes of the road, both on the CPU; and the slopes without the boxes.
 
-        Arguments: see `forward`; all but boxes and horizon, the slopes that it tells, are on the CPU.
+        cameras: image_from_bev, sizes and slopes, see `forward`; on the CPU. horizon: the slopes that it tells.
         """
-        cameras = upload_together((image_from_bev, sizes, expected), boxes.boxes.device)
-        told, expected = self.lift(boxes, *cameras)[-1], cameras[-1]
+        image_from_bev, sizes, expected = upload_together(cameras, boxes.boxes.device)
+        told = self.lift(boxes, image_from_bev, sizes, expected)[-1]
         if horizon is not None:
             measured = horizon.measured(told)
             told = told.joined(*measured)
             expected = (expected or RoadSlopes.unknown().to(told.mean.device)).joined(*measured)
-        told = told.to(image_from_bev.device)
-        return levelled(image_from_bev, told, -self.lift.ground_z), told, expected
+        told = told.to(cameras[0].device)
+        return levelled(cameras[0], told, -self.lift.ground_z), told, expected
 
     def weighed(
         self, outputs: tuple[Tensor, Tensor], hybrid_logits: Tensor, boxes: ImageBoxes, cameras: tuple[Tensor, Tensor]

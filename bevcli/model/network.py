@@ -109,11 +109,8 @@ class Network(TemporalModel):
         image_sizes: Tensor,
         expected: RoadSlopes | None = None,
     ) -> tuple[ImageBoxes | None, Tensor, RoadSlopes | None, RoadSlopes | None]:
-        """What is seen before pillars are projected.
-
-        Returns the boxes of the detector beside the backbone, None without one; the level rig, which is image_from_bev
-        itself where the model does not level it; the slopes that all tell, None where boxes do not; and those without
-        the boxes.
+        """The boxes of the detector beside the backbone, None without one; the level rig, image_from_bev itself where
+        the model does not level it; the slopes of the road, None where boxes do not tell them; and those without boxes.
 
         expected: slopes, see `expected_slopes`. Others: see `ModelInputs`.
         """
@@ -125,7 +122,7 @@ class Network(TemporalModel):
         boxes = self.find_image_boxes(images, has_image, image_sizes)
         if self.hybrid_queries is None or not self.config.levels:
             return boxes, image_from_bev, None, expected
-        return boxes, *self.hybrid_queries.levelled(boxes, image_from_bev, image_sizes, expected, seen)
+        return boxes, *self.hybrid_queries.levelled(boxes, (image_from_bev, image_sizes, expected), seen)
 
     def tokens_of(self, maps: list[Tensor], camera_index: Tensor) -> FeatureMaps:
         """As `image_features`, of the maps of the backbone."""

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.model.small_model import small_config, small_inputs, small_model
+from tests.model.small_model import small_inputs, small_model
 
 import bevcli
-from bevcli.config import load_config
 from bevcli.inference.preprocess import Preprocessor
 from bevcli.model.horizon import COLUMNS, FOLD, ROWS, STEP_DEG, Horizon
-from bevcli.model.hybrid_queries import HybridQueriesConfig
-from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.road_slopes import RoadSlopes, levelled
 
 SIZE = 120, 200  # height and width
@@ -105,10 +102,3 @@ def test_a_model_is_levelled_in_batches_as_alone():
         parts = (x[index : index + 1] for x in (inputs.images, inputs.has_image, inputs.image_from_bev))
         np.testing.assert_allclose(model.look(*parts, inputs.image_sizes[:1])[1][0], level[index], atol=1e-4)
     assert not any(parameter.requires_grad for parameter in model.horizon.parameters())
-
-
-def test_only_one_of_horizon_and_boxes_levels():
-    with pytest.raises(ValueError, match=r"horizon and hybrid_queries\.level both level the rig of each frame"):
-        small_config(horizon=True, image_detector=NanoDetConfig(), hybrid_queries=HybridQueriesConfig(4, level=True))
-    assert load_config("demo").horizon
-    assert not load_config("photographs").horizon

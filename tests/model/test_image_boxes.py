@@ -9,6 +9,7 @@ import torch
 from small_model import HEIGHT, WIDTH, small_config, small_inputs
 from torch import Tensor
 
+from bevcli.config import load_config
 from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.hybrid_queries import HybridQueriesConfig, rectangles_of
@@ -213,7 +214,7 @@ def test_a_rig_is_levelled_by_a_slope_that_is_sure(model, monkeypatch, deviation
     covariance = torch.eye(2)[None] * deviation**2
     monkeypatch.setattr(hybrid.lift, "forward", lambda *_: (RoadSlopes(slopes, covariance),))
     boxes, ground_z = detected(torch.zeros(1, 4)), hybrid.lift.ground_z
-    levelled = hybrid.levelled(boxes, CAMERA.view(1, 1, 4, 4), IMAGE_SIZES)[0][0, 0]
+    levelled = hybrid.levelled(boxes, (CAMERA.view(1, 1, 4, 4), IMAGE_SIZES, None))[0][0, 0]
     if not is_levelled:
         assert torch.equal(levelled, CAMERA)
         return
@@ -221,6 +222,25 @@ def test_a_rig_is_levelled_by_a_slope_that_is_sure(model, monkeypatch, deviation
     in_level = torch.linalg.solve(levelled, CAMERA @ on_road)
     assert in_level[2] == pytest.approx(ground_z, abs=0.01)
     assert in_level[:2].tolist() == pytest.approx([5.0, 20.0], abs=0.02)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("seen", "agrees"), [((0.014, 0.034), True), ((0.05, 0.03), False)])
+def test_a_horizon_counts_where_it_does_not_contradict_the_boxes(model, monkeypatch, seen, agrees):
+    hybrid, slopes, covariance = model.hybrid_queries, torch.tensor([[0.01, 0.03]]), torch.eye(2)[None] * 0.004**2
+    monkeypatch.setattr(hybrid.lift, "forward", lambda *_: (RoadSlopes(slopes, covariance),))
+    horizon = RoadSlopes(torch.tensor([seen]), covariance)
+    cameras = CAMERA.view(1, 1, 4, 4), IMAGE_SIZES, None
+    _, told, expected = hybrid.levelled(detected(torch.zeros(1, 4)), cameras, horizon)
+    np.testing.assert_allclose(told.mean[0], [0.012, 0.032] if agrees else slopes[0], atol=2e-3)
+    assert told.covariance[0, 0, 0] < 0.6 * covariance[0, 0, 0] or not agrees
+    np.testing.assert_allclose(expected.mean[0], seen if agrees else (0, 0), atol=2e-3)  # without the boxes
+
+
+def test_the_model_for_photographs_is_levelled_by_both():
+    config = load_config("photographs")
+    assert config.levels
+    assert config.horizon
 
 
 @torch.no_grad()

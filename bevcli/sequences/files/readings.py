@@ -42,11 +42,6 @@ def ego_from_axes(letters: str) -> Array:
     return result
 
 
-def is_left_handed(letters: str) -> bool:
-    """True for axes of which x times y is not z."""
-    return float(np.linalg.det(ego_from_axes(letters))) < 0
-
-
 @dataclass(frozen=True)
 class Reading:
     """One of the things that a file may mean."""

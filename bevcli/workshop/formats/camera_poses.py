@@ -23,7 +23,6 @@ from bevcli.sequences.files.readings import (
     USUAL_AXES,
     RigReading,
     ego_from_axes,
-    is_left_handed,
 )
 from bevcli.sequences.options import RigOptions
 
@@ -47,6 +46,13 @@ PAIR = "rig_axes", "camera_axes"
 AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
 AXES_FROM_OPTICAL = {name: inverse(rigid(rotation=rotation)) for name, rotation in AXES.items()}  # (4, 4)
 EGO_FROM_BODY = {letters: rigid(rotation=ego_from_axes(letters)) for letters in ALL_AXES}  # (4, 4)
+
+
+def is_left_handed(letters: str) -> bool:
+    """True for axes of which x times y is not z."""
+    return float(np.linalg.det(ego_from_axes(letters))) < 0
+
+
 # Axes of the vehicle and of the cameras: usual ones, and others, both right-handed or both left-handed.
 USUAL_CAMERAS = "optical", "vehicle"
 USUAL = tuple(product(USUAL_AXES, USUAL_CAMERAS))
