@@ -18,7 +18,7 @@ import msgspec
 from bevcli.errors import ConfigError, WeightsError
 from bevcli.parsing.documents import TOML_BYTES, parse_toml
 from bevcli.parsing.files import MIB, read_bytes, read_text
-from bevcli.writing import user_folder, weights_folder, write_whole
+from bevcli.writing import user_folder, weights_folder
 
 HASHES = "hashes.json"
 
@@ -112,7 +112,7 @@ class NamedWeights:
     @property
     def known(self) -> Known | None:
         """The file as it was at the first download from its source; None before. Raises WeightsError."""
-        return _read_hashes(self.folder).get(self.source.source)
+        return read_hashes(self.folder).get(self.source.source)
 
     @property
     def size(self) -> int | None:
@@ -127,12 +127,6 @@ class NamedWeights:
             f"can only be downloaded by hand, from {self.source.page or 'its publisher'}: run the model with "
             f"`weights` (`--weights FILE`), or state the file as `source` of [{self.name}] in {own_table()}"
         )
-
-    def store_hash(self, known: Known) -> None:
-        """Store the hash of a file that was downloaded. Raises OutputError."""
-        hashes = {**_read_hashes(self.folder), self.source.source: known}
-        content = msgspec.json.format(msgspec.json.encode(hashes), indent=1)
-        write_whole(self.folder / HASHES, content + b"\n", parents=True)
 
 
 @dataclass(frozen=True)
@@ -193,7 +187,7 @@ def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
     return weights[name]
 
 
-def _read_hashes(folder: Path) -> dict[str, Known]:
+def read_hashes(folder: Path) -> dict[str, Known]:
     path = folder / HASHES
     if not path.exists():
         return {}

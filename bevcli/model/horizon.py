@@ -119,8 +119,7 @@ class Horizon(nn.Module):
         weights = (self.log_shares - 2 * log_errors).exp() / UNIT**2
         weighted = (weights[..., None] * self.told).flatten(1, 2)  # (B, 2 · COLUMNS / FOLD, 2)
         information = weighted.transpose(1, 2) @ self.told.flatten(0, 1)
-        unknown = RoadSlopes.unknown().to(weights.device)
-        return unknown.joined(information, (weighted * rises.flatten(1)[..., None]).sum(1))
+        return RoadSlopes.unknown(weights.device).joined(information, (weighted * rises.flatten(1)[..., None]).sum(1))
 
 
 class Around(nn.Module):

@@ -100,7 +100,7 @@ class HybridQueries(nn.Module):
         if horizon is not None:
             measured = horizon.measured(told)
             told = told.joined(*measured)
-            expected = (expected or RoadSlopes.unknown().to(told.mean.device)).joined(*measured)
+            expected = (expected or RoadSlopes.unknown(told.mean.device)).joined(*measured)
         told = told.to(cameras[0].device)
         return levelled(cameras[0], told, -self.lift.ground_z), told, expected
 

@@ -133,7 +133,7 @@ class Lift(nn.Module):
         weighted = (rays.bearing * weights[..., None]).flatten(1, 2)  # (B, N · K, 2)
         pull = (weighted * stated.flatten(1, 2)[..., None]).sum(1)
         products = (weighted[..., None] * rays.bearing.flatten(1, 2)[..., None, :]).sum(1)
-        return (expected or RoadSlopes.unknown().to(products.device)).joined(products, pull)
+        return (expected or RoadSlopes.unknown(products.device)).joined(products, pull)
 
 
 class Rays:

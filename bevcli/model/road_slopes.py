@@ -42,9 +42,9 @@ class RoadSlopes:
     covariance: Tensor  # (B, 2, 2)
 
     @classmethod
-    def unknown(cls) -> "RoadSlopes":
+    def unknown(cls, device: torch.device | None = None) -> "RoadSlopes":
         """Where nothing was measured."""
-        return cls(torch.zeros(1, 2), SPREAD**2 * torch.eye(2)[None])
+        return cls(torch.zeros(1, 2, device=device), SPREAD**2 * torch.eye(2, device=device)[None])
 
     @classmethod
     def fitting(cls, information: Tensor, pull: Tensor) -> "RoadSlopes":

@@ -326,6 +326,11 @@ def _stated_classes(content: Mapping[str, Any], path: Path) -> dict[str, ObjectC
         raise InputError(f'{path}: "classes" or "class_settings" is wrong: {error}') from None
 
 
+def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
+    """The boxes with at least this score. Frames without scores keep all boxes."""
+    return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))
+
+
 class BoxesWriter(IncrementalJson):
     """Writes a boxes file frame by frame.
 

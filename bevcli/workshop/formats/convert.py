@@ -14,7 +14,7 @@ from bevcli.geometry.boxes import IMPOSSIBLE
 from bevcli.options import gather, spread
 from bevcli.printing import counted
 from bevcli.recording import entities
-from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes, above_score, read_boxes
 from bevcli.sequences.files.boxes_table import write_csv
 from bevcli.sequences.images import no_image_error
 from bevcli.sequences.open import open_sequence
@@ -25,7 +25,7 @@ from bevcli.workshop.formats import ExportOptions, LabelOptions, WriteOptions
 from bevcli.workshop.formats.kitti import export_kitti
 from bevcli.workshop.formats.labels import WithLabels
 from bevcli.workshop.formats.nuscenes_output import NuScenesWriter, write_submission
-from bevcli.workshop.formats.output import DriveWriter, NativeWriter, above_score
+from bevcli.workshop.formats.output import DriveWriter, NativeWriter
 from bevcli.writing import check_output, whole_file
 
 NAMES = {"mcap": "an MCAP file", "native": "a sequence folder", "nuscenes": "a nuScenes root"}

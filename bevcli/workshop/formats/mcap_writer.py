@@ -16,9 +16,9 @@ from bevcli.geometry.cameras import Camera, CameraRig
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, Color
 from bevcli.geometry.transforms import Array, Pose
 from bevcli.recording.entities import GROUND_TRUTH_COLOR, OTHER_COLOR, class_colors
-from bevcli.sequences.files.boxes_file import BoxesFile, read_boxes
+from bevcli.sequences.files.boxes_file import BoxesFile, above_score, read_boxes
 from bevcli.workshop.formats import WriteOptions
-from bevcli.workshop.formats.output import above_score, image_file
+from bevcli.workshop.formats.output import image_file
 from bevcli.writing import check_output, whole_file
 
 # The fields of foxglove_msgs as they stand in a CDR message; POSE, COLOR and POINTS are short for their types.

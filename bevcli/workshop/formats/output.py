@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,7 +19,7 @@ from bevcli.geometry.ego_motion import EgoMotion, Kinematics
 from bevcli.geometry.transforms import Pose
 from bevcli.parsing.images import encode_image
 from bevcli.printing import cell_of
-from bevcli.sequences.files.boxes_file import BoxesFile, BoxesWriter, FrameBoxes
+from bevcli.sequences.files.boxes_file import BoxesWriter, FrameBoxes
 from bevcli.sequences.files.calibration_file import camera_to_json, write_calibration
 from bevcli.sequences.files.ego_motion_file import ACCELERATION, ANGULAR_RATE, QUATERNION, TRANSLATION, VELOCITY
 from bevcli.sequences.files.map_folder import write_map
@@ -265,8 +264,3 @@ def write_ego_motion(path: Path, motion: EgoMotion) -> None:
         writer.writerow(["timestamp_ns", *TRANSLATION, *QUATERNION, *ACCELERATION, *ANGULAR_RATE, *VELOCITY])
         for time, row in zip(motion.timestamps_ns, numbers, strict=True):
             writer.writerow([int(time), *(repr(float(value)) for value in row)])
-
-
-def above_score(boxes: BoxesFile, score: float) -> BoxesFile:
-    """The boxes with at least this score. Frames without scores keep all boxes."""
-    return replace(boxes, frames=tuple(replace(frame, boxes=frame.boxes.scored(score)) for frame in boxes.frames))

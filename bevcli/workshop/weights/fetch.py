@@ -29,8 +29,8 @@ from bevcli.config import load_config
 from bevcli.errors import BevcliError, OutputError, WeightsError
 from bevcli.parsing.files import hash_of_file, read_bytes
 from bevcli.printing import counted, reason_of
-from bevcli.published import HASHES, Known, NamedWeights
-from bevcli.writing import lock, output_errors
+from bevcli.published import HASHES, Known, NamedWeights, read_hashes
+from bevcli.writing import lock, output_errors, write_whole
 
 PARTIAL = ".partial-"  # before the name of a file that is being downloaded
 STALL_S, STALL_BYTES = 20, 4096  # a transfer that is slower than so many bytes in a second, for so long, is cut
@@ -85,10 +85,17 @@ def fetch_weights(weights: NamedWeights, *, force: bool = False) -> FetchedWeigh
         _remove(partial)
         reason = str(error).replace(f"{partial}: ", "the file ", 1).replace(str(partial), "the file")
         raise WeightsError(f"{weights.source.url}: refused, and deleted: {reason}") from None
-    weights.store_hash(fetched.known)
+    _store_hash(weights, fetched.known)
     os.replace(partial, weights.file)
     _remove(partial)
     return replace(fetched, path=weights.file)
+
+
+def _store_hash(weights: NamedWeights, known: Known) -> None:
+    """Store the hash of a file that was downloaded. Raises OutputError."""
+    hashes = {**read_hashes(weights.folder), weights.source.source: known}
+    content = msgspec.json.format(msgspec.json.encode(hashes), indent=1)
+    write_whole(weights.folder / HASHES, content + b"\n", parents=True)
 
 
 def download_weights(weights: NamedWeights, *, force: bool = False) -> Iterator[tuple[int, int | None]]:
