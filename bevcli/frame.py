@@ -215,8 +215,7 @@ class Frame:
         return texts
 
     def sees(self, boxes: Boxes3D) -> NDArray[np.bool_]:
-        """(N,) bool, boxes of the world frame whose vertical axis is in an image that is not blank: its foot, its
-        middle or its top."""
+        """(N,) bool, boxes of the world frame whose foot, middle or top is in an image that is not blank."""
         points = boxes.centers[:, None] + boxes.sizes_lwh[:, None, 2:] * [[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]]
         seen = np.zeros(len(boxes), dtype=bool)
         for name in (name for name, image in self.images.items() if not image.is_blank):

@@ -43,10 +43,8 @@ def remember(
     if memory is not None and len(memory.boxes):
         old, seconds = memory.boxes, (time_ns - memory.timestamp_ns) / 1e9
         old = replace(old, centers=old.centers + seconds * np.pad(np.nan_to_num(old.velocities), ((0, 0), (0, 1))))
-        old = _weakened(old, np.exp(-seconds / config.remember_s) * np.where(frame.sees(old), MISSED, 1.0)).scored(
-            FORGOTTEN
-        )
-        old = old.transformed(inverse(world_from_bev))
+        share = np.exp(-seconds / config.remember_s) * np.where(frame.sees(old), MISSED, 1.0)
+        old = _weakened(old, share).scored(FORGOTTEN).transformed(inverse(world_from_bev))
         old = old[prediction.grid.holds(old.centers[:, :2])]
         away = np.linalg.norm(old.centers[:, None, :2] - new.centers[:, :2], axis=-1)
         is_same = away < WIDTHS * np.maximum(old.sizes_lwh[:, 1:2], LEAST_WIDTH_M)
