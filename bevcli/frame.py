@@ -218,7 +218,9 @@ class Frame:
         """(N,) bool, boxes of the world frame whose foot, middle or top is in an image that is not blank."""
         points = boxes.centers[:, None] + boxes.sizes_lwh[:, None, 2:] * [[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]]
         seen = np.zeros(len(boxes), dtype=bool)
-        for name in (name for name, image in self.images.items() if not image.is_blank):
+        for name, image in self.images.items():
+            if image.is_blank:
+                continue
             in_ego = apply(inverse(self.world_from_ego_at[name].matrix), points)  # (N, 3, 3)
             seen |= self.rig[name].sees(in_ego).any(-1)
         return seen

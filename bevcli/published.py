@@ -188,6 +188,7 @@ def named_weights(name: str, folder: Path | None = None) -> NamedWeights:
 
 
 def read_hashes(folder: Path) -> dict[str, Known]:
+    """Source -> its file, of those that were downloaded into a folder. Raises WeightsError."""
     path = folder / HASHES
     if not path.exists():
         return {}

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bevcli.geometry.transforms import Array
 from bevcli.parsing.documents import Count
@@ -39,11 +39,6 @@ class BevGrid:
     def nearest_side_m(self) -> float:
         """Distance from the origin of the bev frame to the nearest side of the grid, metres."""
         return min(abs(end) for end in (*self.x_range_m, *self.y_range_m))
-
-    def holds(self, places: Array) -> NDArray[np.bool_]:
-        """(...,) bool, whether places (..., 2), x and y in metres, are on the grid."""
-        low, high = np.transpose([self.x_range_m, self.y_range_m])
-        return np.asarray(((places >= low) & (places <= high)).all(-1))
 
     def cell_centers(self) -> Array:
         """(rows, columns, 2) x and y of the cells' centres, metres."""

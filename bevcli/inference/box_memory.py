@@ -45,7 +45,7 @@ def remember(
         old = replace(old, centers=old.centers + seconds * np.pad(np.nan_to_num(old.velocities), ((0, 0), (0, 1))))
         share = np.exp(-seconds / config.remember_s) * np.where(frame.sees(old), MISSED, 1.0)
         old = _weakened(old, share).scored(FORGOTTEN).transformed(inverse(world_from_bev))
-        old = old[prediction.grid.holds(old.centers[:, :2])]
+        old = old[(prediction.grid.cell_of(old.centers[:, :2]) >= 0).all(-1)]
         away = np.linalg.norm(old.centers[:, None, :2] - new.centers[:, :2], axis=-1)
         is_same = away < WIDTHS * np.maximum(old.sizes_lwh[:, 1:2], LEAST_WIDTH_M)
         is_same &= old.classes[:, None] == new.classes

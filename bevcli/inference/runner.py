@@ -149,7 +149,7 @@ class Runner:
     def begin(
         self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
     ) -> BegunStep:
-        """Launches a step, of which a GPU computes most afterwards. Arguments: see `step`; boxes are not used."""
+        """Launches a step, which a GPU mostly computes afterwards. Arguments: see `step`; tracks and boxes are unused."""
         frame = prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
