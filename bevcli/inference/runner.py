@@ -149,7 +149,7 @@ class Runner:
     def begin(
         self, state: RunnerState[Any], prepared: PreparedFrame, upcoming: Sequence[PreparedFrame] = ()
     ) -> BegunStep:
-        """Launches a step, which a GPU mostly computes afterwards. Arguments: see `step`; tracks and boxes are unused."""
+        """Launches a step, most of which a GPU computes later. Arguments: see `step`; tracks and boxes are not used."""
         frame = prepared.frame
         started_anew = self._new_start(state.stamp, frame.stamp)
         if started_anew:
