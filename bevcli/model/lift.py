@@ -23,7 +23,7 @@ SIZES_WLH = (
 UNKNOWN = -5.0  # logit of a class that the detector does not have, before what is learned
 NO_BOX = -20.0  # logit of all classes where there is no box
 NEAREST_M, FARTHEST_M = 1.0, 100.0
-OF_IMAGE, OF_RAYS = 8 + len(IMAGE_CLASSES), 15  # numbers that the network is told of a box
+OF_IMAGE, OF_RAYS = 7 + len(IMAGE_CLASSES), 15  # numbers that the network is told of a box
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Lift(nn.Module):
         extent = (boxes[..., 2:] - boxes[..., :2]).clamp(min=1.0)
         room = torch.cat([boxes[..., :2] + 0.5, limit - boxes[..., 2:]], -1)  # to the sides of the image
         aspect = (rays.chord / rays.rise).clamp(0.1, 10.0).log()
-        of_image = [(room / 8).clamp(max=1), extent.log() - 4, aspect[..., None], hidden_feet(boxes, scores)[..., None]]
+        of_image = [(room / 8).clamp(max=1), extent.log() - 4, aspect[..., None]]
         seen = torch.cat([*of_image, logits / 3], -1)
         slopes = self._slopes(seen, scores, rays, distances, slopes)
         along = rays.bearing
@@ -180,17 +180,3 @@ class Rays:
         foot = self.height / (tilt - self.foot_slope).clamp(min=0.01)
         parts = [foot, height / self.rise, size[..., :2].mean(-1) / self.chord, top]
         return torch.stack(parts, -1).clamp(NEAREST_M, FARTHEST_M).log()
-
-
-def hidden_feet(boxes: Tensor, scores: Tensor) -> Tensor:
-    """(B, N, K), 0 to 1: the share of the lower edge of a box that a nearer box of the image hides.
-
-    Nearer is a box that reaches lower down. It counts by its score (B, N, K), and less where both are one object's.
-    """
-    a, b = boxes[..., :, None, :], boxes[..., None, :, :]  # the box that is hidden, and that which hides it
-    both = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp(min=0)
-    area, inside = (boxes[..., 2:] - boxes[..., :2]).clamp(min=1).prod(-1), both.prod(-1)  # (B, N, K), (B, N, K, K)
-    overlap = inside / (area[..., :, None] + area[..., None, :] - inside)
-    nearer = (b[..., 3] > a[..., 3] + 2) & (b[..., 1] < a[..., 3])
-    share = both[..., 0] / (a[..., 2] - a[..., 0]).clamp(min=1)
-    return (nearer * share * (1 - overlap) * scores[..., None, :]).amax(-1)

@@ -14,7 +14,7 @@ from bevcli.geometry.object_classes import NUSCENES_CLASSES
 from bevcli.model.bevformer import BEVFormer
 from bevcli.model.hybrid_queries import HybridQueriesConfig, rectangles_of
 from bevcli.model.image_boxes import IMAGE_CLASSES, ImageBoxes, best_image_boxes, without_doubles
-from bevcli.model.lift import NO_BOX, Lift, LiftConfig, hidden_feet
+from bevcli.model.lift import NO_BOX, Lift, LiftConfig
 from bevcli.model.nanodet import NanoDetConfig
 from bevcli.model.road_slopes import RoadSlopes
 
@@ -387,10 +387,3 @@ def test_a_box_of_a_second_class_does_not_count(lift: Lift) -> None:
     logits, *_ = lifted_of(lift, boxes, camera(0))
     assert logits[0, 0].max() > 0
     assert logits[0, 1].max() == NO_BOX
-
-
-def test_a_nearer_box_hides_a_foot() -> None:
-    boxes = torch.tensor([[[[10.0, 10, 30, 50], [20.0, 20, 60, 80]]]])
-    hidden = hidden_feet(boxes, torch.ones(1, 1, 2))[0, 0]
-    assert hidden[0] == pytest.approx(0.5 * (1 - 300 / (800 + 2400 - 300)))
-    assert hidden[1] == 0
