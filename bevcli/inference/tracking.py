@@ -2,7 +2,8 @@
 
 The matching is that of CenterPoint (Yin et al., Center-based 3D Object Detection and Tracking, CVPR 2021, section 4.3):
 the tracks move to the frame's time, and the boxes, highest score first, each take the nearest free track of their class
-within the class's gate. Added here: two score thresholds, scores of tracks, and the suppression of duplicates.
+within the class's gate. Added here: two score thresholds, scores of tracks, the suppression of duplicates, and the
+velocities of boxes that have none of their own, as those that a detector finds in single images.
 """
 
 from collections.abc import Mapping
@@ -15,10 +16,13 @@ from numpy.typing import NDArray
 from bevcli.frame import FrameStamp, Prediction
 from bevcli.geometry.boxes import Boxes3D
 from bevcli.geometry.object_classes import NUSCENES_CLASSES, ObjectClass
-from bevcli.geometry.transforms import Array
+from bevcli.geometry.transforms import Array, inverse
 from bevcli.parsing.documents import Count, NotNegative, Positive, Share
 
 OTHER = "other"  # the gate of classes that have none
+LEAST_SHARE = 0.2  # of a step in the velocity of a track whose boxes have none
+SLOW_MPS = 0.8  # below which such a track may as well stand: its boxes keep their velocity of 0
+FIRST_GATE = 1.6  # times the gate where no velocity is known yet
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Tracks:
         numbers: (T,) identity.
         classes: (T,) names.
         centers_xy: (T, 2) centre of the last box, metres.
-        velocities: (T, 2) velocity of the last box, m/s.
+        velocities: (T, 2) velocity of the last box, or by its steps, m/s. 0 where it is unknown.
         seen_ns: (T,) time of the last box.
         in_view_ns: (T,) time of the last box where a camera looked.
         frames: (T,) number of frames with a box.
@@ -112,6 +116,9 @@ def track(
         return state, prediction
     state, tracked = step(config, state, prediction.boxes_world, prediction.stamp)
     columns = {name: getattr(tracked, name) for name in ("instances", "track_scores", "duplicates")}
+    own = prediction.boxes.velocities
+    turned = tracked.transformed(inverse(prediction.world_from_ego.matrix @ prediction.ego_from_bev)).velocities
+    columns["velocities"] = np.where(own.any(1, keepdims=True), own, turned)
     prediction = replace(prediction, boxes=replace(prediction.boxes, **columns))
     vars(prediction)["boxes_world"] = tracked  # the cached property: boxes are turned once a frame
     return state, prediction
@@ -123,9 +130,10 @@ def step(
     """The state after a frame, and its boxes with their identities.
 
     The boxes have the same order and the columns `instances` ("" for a box without a track), `track_scores` (the mean
-    score of the track's boxes, NaN without a track) and `duplicates`. Boxes that no camera sees (`unseen`) come after
-    the others, start no track, and continue one that was in view within the last `carry_s`. Tracks start anew with a
-    new scene, and where the time does not advance or advances by more than `coast_s` after the last box.
+    score of the track's boxes, NaN without a track) and `duplicates`. A velocity of 0, as of boxes of single images,
+    becomes that of the steps of its track, unless it is slow. Boxes that no camera sees (`unseen`) come after the
+    others, start no track, and continue one that was in view within the last `carry_s`. Tracks start anew with a new
+    scene, and where the time does not advance or advances by more than `coast_s` after the last box.
 
     Args:
         config: the parameters.
@@ -151,8 +159,9 @@ def step(
     tracks = Tracks(*(np.concatenate([getattr(tracks, c.name), getattr(new, c.name)]) for c in fields(Tracks)))
     owned = np.flatnonzero(matches >= 0)
     owners = matches[owned]
+    velocities = boxes.velocities.copy()
+    tracks.velocities[owners], velocities[owned] = _velocities(tracks[owners], boxes[owned], stamp)
     tracks.centers_xy[owners] = boxes.centers[owned, :2]
-    tracks.velocities[owners] = boxes.velocities[owned]
     tracks.seen_ns[owners] = stamp.timestamp_ns
     tracks.in_view_ns[owners[~unseen[owned]]] = stamp.timestamp_ns
     tracks.frames[owners] += 1
@@ -161,7 +170,8 @@ def step(
     instances[owned] = tracks.numbers[owners].astype("<U20")
     track_scores = np.full(len(boxes), np.nan)
     track_scores[owned] = tracks.score_sums[owners] / tracks.frames[owners]
-    tracked = replace(boxes, instances=instances, track_scores=track_scores, duplicates=duplicates)
+    columns = {"instances": instances, "track_scores": track_scores, "duplicates": duplicates}
+    tracked = replace(boxes, velocities=velocities, **columns)
     lost = tracks.seen_ns != stamp.timestamp_ns
     tracks = tracks[~(lost & (tracks.frames < config.confirm_frames))]
     return TrackerState(tracks, stamp, number + len(born)), tracked
@@ -213,10 +223,22 @@ def _match(
     away[unseen[usable, None] & (stamp.timestamp_ns - tracks.in_view_ns > config.carry_s * 1e9)] = np.inf
     other = config.gates_m.get(OTHER, ObjectClass.gate_m)
     gates = [config.gates_m.get(name, other) for name in boxes.classes[usable].tolist()]
-    away[away > np.array(gates, dtype=np.float64)[:, None]] = np.inf
+    wider = np.where(tracks.velocities.any(1) | (not config.use_velocity), 1.0, FIRST_GATE)
+    away[away > np.array(gates, dtype=np.float64)[:, None] * wider] = np.inf
     for box, distances in zip(usable, away, strict=True):
         nearest = int(np.argmin(distances))
         if np.isfinite(distances[nearest]):
             matches[box] = nearest
             away[:, nearest] = np.inf
     return matches
+
+
+def _velocities(tracks: Tracks, boxes: Boxes3D, stamp: FrameStamp) -> tuple[Array, Array]:
+    """Those of N tracks after a frame, and of their boxes, (N, 2) each, see `step`."""
+    seconds = np.maximum(stamp.timestamp_ns - tracks.seen_ns, 1)[:, None] / 1e9
+    steps = (boxes.centers[:, :2] - tracks.centers_xy) / seconds
+    share = np.maximum(1 / (tracks.frames + 1), LEAST_SHARE)[:, None]
+    is_stated = ((tracks.frames == 0) | boxes.velocities.any(1))[:, None]
+    of_tracks = np.where(is_stated, boxes.velocities, tracks.velocities + share * (steps - tracks.velocities))
+    is_slow = ~is_stated & (np.linalg.norm(of_tracks, axis=1, keepdims=True) < SLOW_MPS)
+    return of_tracks, np.where(is_slow, 0.0, of_tracks)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from bevcli.geometry.cameras import Camera
 from bevcli.geometry.ego_motion import Kinematics
 from bevcli.geometry.transforms import apply, inverse
+from bevcli.inference import run
 from bevcli.inference.load import load_model
 from bevcli.inference.preprocess import Preprocessor, image_from_bev
 from bevcli.inference.runner import Runner
@@ -110,3 +111,18 @@ def test_official_tiny_weights_give_the_official_boxes(shared, first_frame):
     for name, center, score in zip(names, centers, reference["scores_3d"], strict=True):
         near = np.linalg.norm(found.centers - center, axis=1) < 0.3
         assert (near & (found.classes == name) & (np.abs(found.scores - score) < 0.05)).any(), (name, center, score)
+
+
+@pytest.mark.slow
+def test_a_car_that_follows_has_the_velocity_of_its_track(drive):
+    model = load_model("photographs")
+    *_, (frame, prediction) = run(model, drive)
+    world, truth = prediction.boxes_world, frame.ground_truth
+    cars, true_cars = (boxes[boxes.classes == "car"] for boxes in (world, truth))
+    away = np.linalg.norm(cars.centers[:, None, :2] - true_cars.centers[:, :2], axis=-1)
+    follower = np.linalg.norm(true_cars.centers - frame.world_from_ego.translation, axis=1).argmin()
+    found = cars.velocities[away[:, follower].argmin()]
+    assert found == pytest.approx(true_cars.velocities[follower], abs=2)
+    assert np.linalg.norm(found) > 5
+    turned = prediction.boxes.transformed(prediction.world_from_ego.matrix @ prediction.ego_from_bev)
+    assert turned.velocities == pytest.approx(world.velocities, abs=0.01)

@@ -57,6 +57,31 @@ def out_of_view(boxes, *unseen):
     return replace(boxes, unseen=np.array(unseen))
 
 
+def seen_in_single_images(speed, count=6, noise_m=0.0):
+    """A car ahead of others, whose boxes state no velocity, with noise along the road."""
+    noise = noise_m * np.random.default_rng(1).normal(size=count)
+    return [frame(box(speed * k / 2 + noise[k], 0), box(0, 20)) for k in range(count)]
+
+
+def test_boxes_without_velocities_get_those_of_their_tracks():
+    tracked, state = track(seen_in_single_images(8.0))
+    assert {boxes.instances[0] for boxes in tracked} == {"0"}
+    assert [boxes.velocities[0, 0] for boxes in tracked[:3]] == pytest.approx([0, 4, 8 * 2 / 3])
+    assert tracked[-1].velocities[0] == pytest.approx((8, 0), abs=2.5)
+    assert (tracked[-1].velocities[1] == 0).all()
+    assert state.tracks.velocities[0] == pytest.approx(tracked[-1].velocities[0])
+
+
+def test_a_slow_track_may_as_well_stand():
+    tracked, _ = track(seen_in_single_images(0.0, count=20, noise_m=0.3))
+    assert all((boxes.velocities == 0).all() for boxes in tracked[3:])
+
+
+def test_a_stated_velocity_is_kept():
+    tracked, _ = track([box(4.0 * k, 0, (6.5, 0.5)) for k in range(4)])
+    assert all((boxes.velocities == (6.5, 0.5)).all() for boxes in tracked)
+
+
 def test_a_box_where_no_camera_looks_starts_no_track():
     seen, unseen = (out_of_view(frame(box(0, 0), box(9, 0)), False, hidden) for hidden in (False, True))
     assert identities([unseen, unseen, seen]) == [["0", ""], ["0", ""], ["0", "1"]]

@@ -2,10 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import permutations, product
-
-import numpy as np
 
 from bevcli.errors import InputError
 from bevcli.geometry.transforms import Array
@@ -26,20 +23,6 @@ POSE_ANGLES = {unit: f"yaw in {unit} counter-clockwise from x" for unit in ("rad
     "clockwise": "yaw in degrees clockwise from x", "clockwise-radians": "yaw in radians clockwise from x",
 }  # fmt: skip
 WORDS = {"rig_angles": ORDERS | ANGLES, "pose_angles": ORDERS | POSE_ANGLES | {"vector": ANGLES["vector"]}}
-
-
-@cache
-def ego_from_axes(letters: str) -> Array:
-    """(3, 3), read-only, from a frame with other axes to x forward, y left, z up; it mirrors left-handed ones.
-
-    Raises InputError for letters that are not of `ALL_AXES`.
-    """
-    if letters not in ALL_AXES:
-        raise InputError(f'axes "{letters:.20}" mean nothing (expected three letters such as flu, frd or rub)')
-    signed = [("flu".find(letter), "brd".find(letter)) for letter in letters]
-    result = np.stack([np.eye(3)[plus] if plus >= 0 else -np.eye(3)[minus] for plus, minus in signed], axis=1)
-    result.flags.writeable = False
-    return result
 
 
 @dataclass(frozen=True)

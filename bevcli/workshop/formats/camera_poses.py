@@ -7,6 +7,7 @@ decide between the others (`bevcli.workshop.readings`).
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -22,7 +23,6 @@ from bevcli.sequences.files.readings import (
     LEFT_HANDED,
     USUAL_AXES,
     RigReading,
-    ego_from_axes,
 )
 from bevcli.sequences.options import RigOptions
 
@@ -42,6 +42,22 @@ TOLERANCE = 1e-3
 SAME = 1e-3  # largest difference of matrices that are the same
 Fields: TypeAlias = dict[str, Any]
 PAIR = "rig_axes", "camera_axes"
+
+
+@cache
+def ego_from_axes(letters: str) -> Array:
+    """(3, 3), read-only, from a frame with other axes to x forward, y left, z up; it mirrors left-handed ones.
+
+    Raises InputError for letters that are not of `ALL_AXES`.
+    """
+    if letters not in ALL_AXES:
+        raise InputError(f'axes "{letters:.20}" mean nothing (expected three letters such as flu, frd or rub)')
+    signed = [("flu".find(letter), "brd".find(letter)) for letter in letters]
+    result = np.stack([np.eye(3)[plus] if plus >= 0 else -np.eye(3)[minus] for plus, minus in signed], axis=1)
+    result.flags.writeable = False
+    return result
+
+
 # (3, 3) camera_from_axes: from a camera frame with other axes to x right, y down, z forward.
 AXES = {name: ego_from_axes("rdf").T @ ego_from_axes(letters) for name, letters in CAMERA_AXES.items()}
 AXES_FROM_OPTICAL = {name: inverse(rigid(rotation=rotation)) for name, rotation in AXES.items()}  # (4, 4)

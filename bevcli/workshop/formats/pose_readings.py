@@ -23,10 +23,9 @@ from bevcli.sequences.files.readings import (
     CAMERA_AXES,
     LEFT_HANDED,
     PoseReading,
-    ego_from_axes,
 )
 from bevcli.sequences.options import RigOptions
-from bevcli.workshop.formats.camera_poses import is_left_handed
+from bevcli.workshop.formats.camera_poses import ego_from_axes, is_left_handed
 from bevcli.workshop.formats.pose_table import MATRIX, QUATERNION, ROTATION_VECTOR, VECTOR, Table
 
 MOVING_M_S, MOVING_M = 1.0, 2.0  # slower steps, and drives with less distance, show no direction
