@@ -31,7 +31,7 @@ class LiftConfig:
     """The lift."""
 
     width: int = 64  # channels of its two hidden layers
-    feature_width: int = 16  # channels to which the features of the detector are reduced; 0 leaves them out
+    feature_width: int = 16  # channels to which the features of the detector are reduced
     dropout: float = 0.2  # of these features, probability
 
 
@@ -52,7 +52,7 @@ class Lift(nn.Module):
         self.register_buffer("known", known, persistent=False)
         self.register_buffer("sizes", torch.tensor(SIZES_WLH), persistent=False)
         self.dropout = nn.Dropout(config.dropout)
-        self.reduce = nn.Linear(channels, config.feature_width) if config.feature_width else None
+        self.reduce = nn.Linear(channels, config.feature_width)
         inputs = OF_IMAGE + OF_RAYS + config.feature_width
         self.tilt = nn.Sequential(nn.Linear(OF_IMAGE, 32), nn.ReLU(), nn.Linear(32, 2))
         self.network = nn.Sequential(
@@ -97,8 +97,8 @@ class Lift(nn.Module):
         doubt = ((along[..., None, :] * slopes.covariance[:, None, None]).sum(-1) * along).sum(-1)  # variance of tilt
         level = rays.distances(mean, tilt)
         steps = [x[..., :1] - x[..., 1:2] for x in (distances, level)]
-        features = [] if self.reduce is None else [self.reduce(self.dropout(found.features.float()))]
-        told = [seen, rays.numbers, distances - 2.5, level - 2.5, *steps, doubt[..., None].log() / 4 + 2.3, *features]
+        features = self.reduce(self.dropout(found.features.float()))
+        told = [seen, rays.numbers, distances - 2.5, level - 2.5, *steps, doubt[..., None].log() / 4 + 2.3, features]
         numbers = self.network(torch.cat([x.clamp(-4, 4) for x in told], -1))
         weights, place, correction = numbers.split([4, 8, len(self.known)], -1)
         # The first guess is the mean of the distances by foot and by height.
