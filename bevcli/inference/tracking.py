@@ -21,7 +21,7 @@ from bevcli.parsing.documents import Count, NotNegative, Positive, Share
 
 OTHER = "other"  # the gate of classes that have none
 LEAST_SHARE = 0.2  # of a step in the velocity of a track whose boxes have none
-SLOW_MPS = 0.8  # below which such a track may as well stand: its boxes keep their velocity of 0
+SLOW_MPS = 0.8  # below which such a track may as well stand, twice this after one step: its boxes keep their 0
 FIRST_GATE = 1.6  # times the gate where no velocity is known yet
 
 
@@ -237,8 +237,9 @@ def _velocities(tracks: Tracks, boxes: Boxes3D, stamp: FrameStamp) -> tuple[Arra
     """Those of N tracks after a frame, and of their boxes, (N, 2) each, see `step`."""
     seconds = np.maximum(stamp.timestamp_ns - tracks.seen_ns, 1)[:, None] / 1e9
     steps = (boxes.centers[:, :2] - tracks.centers_xy) / seconds
-    share = np.maximum(1 / (tracks.frames + 1), LEAST_SHARE)[:, None]
+    frames = np.maximum(tracks.frames, 1)[:, None]
+    share = np.maximum(1 / (frames + 1), LEAST_SHARE)
     is_stated = ((tracks.frames == 0) | boxes.velocities.any(1))[:, None]
     of_tracks = np.where(is_stated, boxes.velocities, tracks.velocities + share * (steps - tracks.velocities))
-    is_slow = ~is_stated & (np.linalg.norm(of_tracks, axis=1, keepdims=True) < SLOW_MPS)
+    is_slow = ~is_stated & (np.linalg.norm(of_tracks, axis=1, keepdims=True) < SLOW_MPS * (1 + 1 / frames))
     return of_tracks, np.where(is_slow, 0.0, of_tracks)
