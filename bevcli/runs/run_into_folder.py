@@ -49,7 +49,8 @@ class RunFiles:
     """`with RunFiles(…) as files: files.write(step)`: recording, boxes, tracks, maps, BEV features, further results.
 
     A frame that is written is counted, and the state is saved as often as SHARE of the run's time allows. The end of
-    the block, whatever causes it, saves the state after the last whole frame.
+    the block, whatever causes it, saves the state after the last whole frame. predictions.json states at every moment
+    which frames the other files hold too: it gets a frame last, and is removed or cut first.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class RunFiles:
 
     def __enter__(self) -> "RunFiles":
         out, drive, model, resume = self._out, self._drive, self._model, self._resume
-        for name in (RECORDING, PREDICTIONS, *((TRACKS,) if self._options.track else ())):
+        for name in (PREDICTIONS, RECORDING, *((TRACKS,) if self._options.track else ())):
             self._folder.add(out / name)
         past = None if resume is None else resume.recording
         recording = Recording(out / RECORDING, drive, model, self._options.recording, self._live, past)
@@ -99,8 +100,8 @@ class RunFiles:
             **({"x_range_m": list(grid.x_range_m), "y_range_m": list(grid.y_range_m)} if config.results else {}),
         }
         with self._stack:  # closes what is open if the next one cannot be opened
-            self._recording = self._stack.enter_context(recording)
             self._boxes = self._open(PREDICTIONS, BoxesWriter, frame_of_reference=self._reference, extras=extras)
+            self._recording = self._stack.enter_context(recording)
             if self._options.track:
                 self._tracks = self._open(TRACKS, CsvWriter)
             if config.image_classes or self._options.score_without_labels:
@@ -183,7 +184,7 @@ class RunFiles:
         ground = prediction.ground if in_world else replace(prediction.ground, world_from_ego=None)
         for result, writer in self._results.items():
             writer.write(ground, result_of(result, prediction.results))
-        self._boxes.write(of_frame)  # last: a frame in predictions.json is in the other files too
+        self._boxes.write(of_frame)  # last
         if any(file.is_deleted() for file in (self._recording.file, *self._files.values())):
             raise OutputError(f"{self._out}: the files of this run were deleted while it was writing them")
 

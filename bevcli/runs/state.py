@@ -49,7 +49,7 @@ class RunFolder(contextlib.ExitStack):
         self.path, self.state_path = path, path / OWN / "state.pt"
         self._force, self._resume = force, resume
         self._written: GrowingFile | None = None
-        self._names: set[str] = set()
+        self._names: dict[str, None] = {}  # in the order in which runs made them
         self._is_new, self._is_discarded = not path.exists(), False
 
     def __enter__(self) -> "RunFolder":
@@ -71,7 +71,7 @@ class RunFolder(contextlib.ExitStack):
                 names = read_bytes(written, LARGEST_LIST, error=OutputError).decode(errors="replace").splitlines()
                 # A path with ".." would leave the folder: no run of ours writes one.
                 inside = (not Path(name).is_absolute() and ".." not in Path(name).parts for name in names)
-                self._names = {name for name, is_inside in zip(names, inside, strict=True) if name and is_inside}
+                self._names = dict.fromkeys(name for name, good in zip(names, inside, strict=True) if name and good)
             self.push(stack.pop_all())
         return self
 
@@ -93,21 +93,21 @@ class RunFolder(contextlib.ExitStack):
             self._written = GrowingFile(file, file.stat().st_size if file.exists() else None)
             self.callback(self._written.close)
         self._written.append(f"{name}\n".encode())
-        self._names.add(name)
+        self._names[name] = None
 
     def has_files(self) -> bool:
         """Runs have written files."""
         return bool(self._names)
 
     def remove_written(self) -> None:
-        """Remove the files that earlier runs wrote, and nothing else. Raises OutputError."""
+        """Remove the files that earlier runs wrote, in that order, and nothing else. Raises OutputError."""
         named = [path for name in self._names for path in (self.path / name, partial_path(self.path / name))]
         files = [path for path in named if self._holds(path)]
         for path in (*files, self.state_path, self.path / OWN / "written"):
             with output_errors(path, "removed"):
                 if path.is_file() or path.is_symlink():
                     path.unlink()
-        self._names = set()
+        self._names = {}
 
     def discard(self) -> None:
         """Remove what this run wrote, and on exit the folder if this run made it. Raises OutputError."""

@@ -16,6 +16,7 @@ from bevcli.inference.load import Model
 from bevcli.inference.tracking import TrackerConfig
 from bevcli.model.bevformer import BEVFormer
 from bevcli.recording import RecordingOptions
+from bevcli.recording.writer import Recording
 from bevcli.runs import RunOptions
 from bevcli.runs.run_into_folder import run_in_folder, run_into_folder
 from bevcli.runs.state import load_state, save_state
@@ -103,6 +104,25 @@ def test_a_resumed_run_equals_an_uninterrupted_one(model, whole, tmp_path, finis
     assert len(read_boxes(out / "predictions.json").frames) == finished
     run_all(model, out, resume=True)
     assert_equals(out, whole)
+
+
+def test_boxes_of_a_resumed_run_that_is_killed_are_all_in_its_recording(model, tmp_path, monkeypatch):
+    out, states = tmp_path / "out", []
+    for frames in (2, 3):
+        with pytest.raises(KeyboardInterrupt):
+            run_all(model, out, MadeDrive(broken=frames), resume=True)
+        states.append((out / ".bevcli/state.pt").read_bytes())
+    (out / ".bevcli/state.pt").write_bytes(states[0])  # as if the third frame's had not been saved yet
+
+    def kill(*_arguments, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Recording, "_send_layout", kill)  # its file is open
+    with pytest.raises(KeyboardInterrupt):
+        run_all(model, out, resume=True)
+    with open_recording(out / "recording.rrd") as file:
+        recorded = [frame.index for frame in RecordingReader(file).frames()]
+    assert [frame.stamp.index for frame in read_boxes(out / "predictions.json").frames] == recorded == [0, 1]
 
 
 def test_a_resumed_run_keeps_the_frames_that_failed(model, tmp_path):
