@@ -25,6 +25,7 @@ from bevcli.inference.preprocess import Preprocessor
 from bevcli.inference.runner import RunnerState
 from bevcli.model import Precision
 from bevcli.model.config import ModelConfig
+from bevcli.model.kernels.onednn import has_onednn
 from bevcli.model.network import build_network
 from bevcli.model.pillar_projection import PillarHits
 from bevcli.model.prepare import DTYPES, prepare_for_inference
@@ -281,9 +282,14 @@ def _recording(drive: MadeUpDrive, fast: Version) -> Iterator[Recording]:
 
 
 def measure_limits(device: torch.device, precision: Precision) -> MachineLimits:
-    """The best of several matrix products in a precision, and of several copies, on a device."""
-    edge = GPU_EDGE if device.type == "cuda" else CPU_EDGE
-    matrix = torch.randn(edge, edge, device=device).to(DTYPES[precision])
+    """The best of several matrix products in a precision, and of several copies, on a device.
+
+    On a CPU without instructions for the precision: of products in float32, as those in its own take minutes.
+    """
+    edge, dtype = GPU_EDGE if device.type == "cuda" else CPU_EDGE, DTYPES[precision]
+    if device.type == "cpu" and not has_onednn(dtype):
+        dtype = torch.float32
+    matrix = torch.randn(edge, edge, device=device).to(dtype)
     product = torch.empty_like(matrix)
     source, target = (torch.ones(COPIED_FLOATS, device=device) for _ in range(2))
     gemm_s = _best_seconds(lambda: torch.mm(matrix, matrix, out=product), device)
