@@ -31,7 +31,7 @@ PATH = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 NO_INDEX = re.compile(r"NewConnectionError|NameResolutionError|\(from versions: none\)")
 # Files of the package that are no code. NOTICE states where each comes from.
 DATA = re.compile(
-    r"bevcli/(py\.typed|configs/[\w-]+\.toml|weights/(demo\.safetensors|sources\.toml)"
+    r"bevcli/(py\.typed|configs/[\w-]+\.toml|weights/((demo|photographs)\.safetensors|sources\.toml)"
     r"|samples/(street/.*|first_steps\.ipynb))"
 )
 TEST_PROGRAMS = ("pytest", "pytest-timeout", "hypothesis", "mcap-ros2-support")
