@@ -255,8 +255,10 @@ def _undistorted(bent: Array, distortion: Distortion) -> Array:
 
     OpenCV's solution alone is off by some pixels at strong distortion, so it is refined.
     """
+    if not bent.size:  # OpenCV 4 refuses it
+        return bent
     solved = cv2.undistortPoints(bent.reshape(-1, 1, 2), np.eye(3), np.array(distortion.coefficients))
-    rays = np.asarray(bent if solved is None else solved, dtype=np.float64).reshape(bent.shape)  # None for no points
+    rays = np.asarray(solved, dtype=np.float64).reshape(bent.shape)
     for _ in range(REFINEMENTS):
         rays = rays + (bent - distort(rays, distortion))
     error = np.abs(distort(rays, distortion) - bent).max(-1, keepdims=True)

@@ -84,14 +84,15 @@ def open_capture(path: Path) -> cv2.VideoCapture:
     if not is_transport and not any(start[offset:].startswith(magic) for offset, magic in CONTAINERS):
         raise InputError(f"{path} is not a video (expected MP4, MOV, MKV, WebM, AVI or MPEG-TS)")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # nothing: what fails here is told in one line
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    set_log_level = getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel  # OpenCV 4; OpenCV 5
+    level = set_log_level(0)  # silent
     try:
         with plain_name(path) as name:
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     except cv2.error:
         capture = cv2.VideoCapture()
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        set_log_level(level)
     if not capture.isOpened():
         raise InputError(
             f"{path} cannot be opened as a video: it is cut short, has sound only, or a codec that is not read "

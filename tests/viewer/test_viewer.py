@@ -103,7 +103,7 @@ def test_without_vulkan_each_try_names_the_driver(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_screenshot_of_a_missing_frame_is_an_error(screenshot):
     *_, folder = screenshot
-    with pytest.raises(InputError, match="frames 0 to 2"):
+    with pytest.raises(InputError, match="3 frames from 0 to 2"):
         take_screenshot(folder / "recording.rrd", folder / "other.png", 7)
 
 
