@@ -38,7 +38,7 @@ def random_quaternions(count):
 
 @pytest.mark.parametrize("quaternion", random_quaternions(20))
 def test_rotation_agrees_with_scipy_both_ways(quaternion):
-    expected = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()  # scalar last
+    expected = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     assert rotation_from_quaternion(quaternion) == pytest.approx(expected, abs=1e-12)
     back = quaternion_from_rotation(expected)
     assert back[0] >= 0
