@@ -232,7 +232,7 @@ def test_a_browser_shows_the_recording(tmp_path):
         urllib.request.urlopen(address, timeout=2)
 
 
-def wait_for_image(page, seconds: float = 90) -> np.ndarray:
+def wait_for_image(page, seconds: float = 240) -> np.ndarray:
     deadline = time.monotonic() + seconds
     while True:
         page.wait_for_timeout(2000)
