@@ -69,6 +69,6 @@ def test_int8_finds_most_of_the_boxes(model, file, tmp_path):
             step_of_file(load_exported(tmp_path / "int8.onnx", "onnxruntime"), small_inputs()),
         )
     bevs, boxes = [x.bev for x in outputs], [x.image_boxes for x in outputs]
-    assert 1e-5 < (bevs[0] - bevs[1]).norm() / bevs[0].norm() < 0.15  # of random weights
+    assert 1e-5 < (bevs[0] - bevs[1]).norm() / bevs[0].norm() < 0.2  # of random weights; 0.16 with AVX2 only
     nearest = torch.cdist(boxes[0].boxes[0], boxes[1].boxes[0]).amin(-1)
     assert (nearest < 4).float().mean() > 0.8, nearest
