@@ -168,7 +168,7 @@ def test_a_drive_that_shows_no_road_keeps_what_is_stated(drive):
 )
 def test_rays_are_the_inverse_of_the_projection(distortion):
     camera = Camera("A", 1000, 600, np.array([[700.0, 0, 480], [0, 690, 310], [0, 0, 1]]), np.eye(4), distortion)
-    points = Rotation.random(200, 0).apply([0, 0, 5.0])
+    points = Rotation.random(200, rng=0).apply([0, 0, 5.0])
     points = points[points[:, 2] > 3.5]
     pixels, _ = camera.project(points)
     assert np.allclose(camera.rays(pixels), points / 5, atol=1e-5)
